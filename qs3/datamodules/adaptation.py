@@ -14,16 +14,13 @@ import numpy as np
 from lightning.pytorch import LightningDataModule
 from torch import Generator, Tensor
 
-from qs3.datamodules.augment import Augment
-from qs3.datamodules.batches import Batches, Piece, Table, generator_of
-from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.augment import Augment, augmented
+from qs3.datamodules.batches import Batches, Piece, generator_of
+from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
-from qs3.datamodules.splits import Labelled, Unlabelled
-from qs3.datamodules.twins import Wants, augmented
 from qs3.datasets.domain import Domain
 from qs3.datasets.ensure_source import check_or_make
-from qs3.errors import ConfigError
 from qs3.utils.seeding import derive
 
 
@@ -41,10 +38,10 @@ class AdaptationData(LightningDataModule):
         owner: whose labels are trained on: "source", or "target_train" for the upper bound
             (`method=supervised`), which alone asks for them.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
-        wants: what they hold beside clouds and labels (see `qs3.datamodules.twins`).
+        again: whether they hold a second draw of each source cloud.
         sampler: "shuffled" trains on each labelled cloud once an epoch; "balanced" on as many
-            clouds of each class (see `batches.balanced`). For the source alone: how often the
-            target's classes occur is not known.
+            clouds of each class (see `batches.balanced`). For the source alone: to balance the
+            target's classes takes its true labels.
         make_source: a generated source that is not there is made first.
         points, scale, fps_starts, val, eval_batch_size, cache_dir, clouds_a_split: see
             `DomainData`.
@@ -68,7 +65,7 @@ class AdaptationData(LightningDataModule):
         seed: int,
         owner: str = "source",
         uses_target: bool = False,
-        wants: Wants | None = None,
+        again: bool = False,
         points: int = 1024,
         scale: str = "unit_ball",
         fps_starts: int = 4,
@@ -81,18 +78,7 @@ class AdaptationData(LightningDataModule):
         clouds_a_class: int | None = None,
     ) -> None:
         super().__init__()
-        if sampler == "balanced" and owner != "source":
-            raise ConfigError(
-                "data.sampler=balanced draws source clouds only. Balancing the target's classes "
-                "takes its true labels, which one released code does and which makes its figures "
-                "incomparable; set data.sampler=shuffled"
-            )
-        if target.views == "random":
-            raise ConfigError(
-                "data.target.views=random: a target's clouds are what was measured; it is for "
-                "sources, data.source.views=random"
-            )
-        self.wants = wants or Wants()
+        assert sampler == "shuffled" or owner == "source"
         shared: dict[str, Any] = {
             "points": points,
             "scale": scale,
@@ -107,12 +93,10 @@ class AdaptationData(LightningDataModule):
             val=val,
             sampler=sampler,
             clouds_a_class=clouds_a_class,
-            asks="data.source" if owner == "source" else "method=supervised",
-            twin=self.wants.twin,
             **shared,
         )
         self.target_domain = DomainData(target, labels=False, **shared)
-        self.owner, self.uses_target = owner, uses_target
+        self.owner, self.uses_target, self.again = owner, uses_target, again
         self.phases, self.scheme, self.augment = phases, scheme, augment
         self.scale = scale
         self.batch_size, self.eval_batch_size, self.seed = batch_size, eval_batch_size, seed
@@ -128,7 +112,7 @@ class AdaptationData(LightningDataModule):
     def all_labelled(self) -> Clouds:
         """The clouds of the warm-up and the held-out ones, after `setup`."""
         assert self.labelled_domain.whole is not None
-        return self.labelled_domain.whole.clouds
+        return self.labelled_domain.whole
 
     @property
     def validation(self) -> Labelled:
@@ -137,9 +121,9 @@ class AdaptationData(LightningDataModule):
         return self.labelled_domain.validation
 
     @property
-    def target(self) -> Unlabelled:
+    def target(self) -> Clouds:
         """The target's training clouds, after `setup`."""
-        assert isinstance(self.target_domain.train, Unlabelled)
+        assert isinstance(self.target_domain.train, Clouds)
         return self.target_domain.train
 
     def prepare_data(self) -> None:
@@ -165,19 +149,20 @@ class AdaptationData(LightningDataModule):
         """The batches of the current epoch (the trainer asks anew each epoch)."""
         epoch = self.trainer.current_epoch if self.trainer else 0
         warmup = self.phases.phase(epoch) == 0
-        tables = {}
-        if warmup or self.scheme.use_source:
-            tables = {"source": self._labelled(self.wants if warmup else Wants())}
+        parts: dict[str, Clouds | Labelled] = {}
         if not warmup:
-            tables = {"target": self._pseudo_labelled(), **tables}
-        elif self.uses_target:
-            clouds = self.target.clouds
-            beside = {"twin": clouds} if self.wants.target_twin else {}
-            tables["target"] = Table(clouds, {}, beside=beside)
+            assert self.pseudo is not None, "a round has begun without pseudo-labels"
+            index, labels = self.pseudo
+            parts["target"] = Labelled(self.target.at(index.numpy()), labels, "y_pseudo")
+        if warmup or self.scheme.use_source:
+            owner, again = f"y_{self.owner}", self.again and warmup
+            parts["source"] = replace(self.labelled, owner=owner, again=again)
+        if warmup and self.uses_target:
+            parts["target"] = self.target
         steps = self.phases.steps(epoch)
         start, _ = self.phases.span(self.phases.phase(epoch))
         return Batches(
-            tables,
+            parts,
             self.batch_size if warmup else self.scheme.batch_size,
             seed=self.seed,
             epoch=epoch,
@@ -196,13 +181,13 @@ class AdaptationData(LightningDataModule):
         part = self.validation
         limit = 1.0 if self.trainer is None else self.trainer.limit_val_batches
         if isinstance(limit, int) or limit != 1.0:  # 1 is one batch, 1.0 are all
-            lot = [derive(0, "validation order", name) for name in part.ids]
-            part = part.at(np.argsort(np.array(lot)))
-        return self._in_order("source", Table(part.clouds, {f"y_{self.owner}": part.labels}))
+            order = [derive(0, "validation order", name) for name in part.ids]
+            part = part.at(np.argsort(np.array(order)))
+        return self._in_order("source", replace(part, owner=f"y_{self.owner}"))
 
     def predict_dataloader(self) -> Batches:
         """The target's training clouds, in order and without labels."""
-        return self._in_order("target", Table(self.target.clouds, {}))
+        return self._in_order("target", self.target)
 
     def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
         """Augment training batches, each domain with its own randomness."""
@@ -216,8 +201,7 @@ class AdaptationData(LightningDataModule):
                 def generator(use: str, name: str = name, device: Any = device) -> Generator:
                     return generator_of(batch, f"{name} {use}".strip(), self.seed, rank, device)
 
-                together = name != "target"
-                result[name] = augmented(self.augment, part, generator, self.scale, together)
+                result[name] = augmented(self.augment, part, generator, self.scale)
         return result
 
     def state_dict(self) -> dict[str, Any]:
@@ -228,23 +212,9 @@ class AdaptationData(LightningDataModule):
         """Restore `state_dict`."""
         self.pseudo = (state_dict["index"], state_dict["labels"]) if state_dict else None
 
-    def _in_order(self, name: str, table: Table) -> Batches:
-        size = self.eval_batch_size
-        pinned = self._pinned()
-        return Batches({name: table}, size, seed=self.seed, epoch=0, shuffle=False, pinned=pinned)
+    def _in_order(self, name: str, part: Clouds | Labelled) -> Batches:
+        size, pinned = self.eval_batch_size, self._pinned()
+        return Batches({name: part}, size, seed=self.seed, epoch=0, shuffle=False, pinned=pinned)
 
     def _pinned(self) -> bool:
         return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
-
-    def _labelled(self, wants: Wants) -> Table:
-        y = f"y_{self.owner}"
-        balance = y if self.labelled_domain.sampler == "balanced" else None
-        table = self.labelled_domain.training_table({y: self.labelled.labels}, balance)
-        if wants.again:
-            table = replace(table, beside={**table.beside, "again": table.sources["points"]})
-        return self.labelled_domain.with_twins(table) if wants.twin else table
-
-    def _pseudo_labelled(self) -> Table:
-        assert self.pseudo is not None, "a round has begun without pseudo-labels"
-        index, labels = self.pseudo
-        return Table(self.target.clouds.at(index.numpy()), {"y_pseudo": labels})

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Interval
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.config.checks import check_int, check_ranges
+from qs3.utils.settings import settings
 
 REGION_SHARE = (0.1, 0.25)
 """The smallest and largest share of a cloud's points that a dropped region takes."""
 
 
-@dataclass(frozen=True)
+@settings
 class Augment:
     """Cut, holes, turn about z, anisotropic scale, shift, lift and jitter, in this order.
 
@@ -34,20 +37,14 @@ class Augment:
             the paper's descends from 0.02.
     """
 
-    crop: float = 1.0
-    drop_regions: int = 0
+    crop: Annotated[float, Interval(gt=0, le=1)] = 1.0
+    drop_regions: Annotated[int, Interval(ge=0, le=3)] = 0
     rotate_z: bool = True
-    scale: float = 1.0
-    shift: float = 0.0
-    lift: float = 0.0
-    jitter_sigma: float = 0.01
-    jitter_clip: float = 0.05
-
-    def __post_init__(self) -> None:
-        noise = dict.fromkeys(("shift", "lift", "jitter_sigma", "jitter_clip"), ">= 0")
-        check_ranges(self, "protocol.augment.", scale=">= 1", drop_regions="[0, 3]", **noise)
-        check_ranges(self, "protocol.augment.", crop="(0, 1]")
-        check_int("protocol.augment.drop_regions", self.drop_regions, 0)
+    scale: Annotated[float, Ge(1)] = 1.0
+    shift: Annotated[float, Ge(0)] = 0.0
+    lift: Annotated[float, Ge(0)] = 0.0
+    jitter_sigma: Annotated[float, Ge(0)] = 0.01
+    jitter_clip: Annotated[float, Ge(0)] = 0.05
 
     def __call__(
         self,
@@ -134,6 +131,30 @@ class Moves:
             if way is not None:
                 points = points + way
         return points
+
+
+def augmented(
+    augment: Augment,
+    part: Mapping[str, Tensor],
+    generator: Callable[[str], torch.Generator],
+    scale: str,
+) -> dict[str, Tensor]:
+    """A domain's part of a batch with its clouds augmented.
+
+    A second draw ("again") is turned, scaled, shifted and lifted as the first: both show one object
+    in one place. Cuts, holes and jitter are each one's own.
+
+    Args:
+        augment: of all clouds.
+        part: "points", perhaps "again", and labels.
+        generator: of a use, on the clouds' device: "" for the clouds themselves.
+        scale: see `qs3.datamodules.clouds`.
+    """
+    result = dict(part)
+    result["points"], moves = augment.with_moves(part["points"], generator(""), scale)
+    if "again" in part:
+        result["again"], _ = augment.with_moves(part["again"], generator("again"), scale, moves)
+    return result
 
 
 def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, " b"]) -> Float[Tensor, "b n 3"]:

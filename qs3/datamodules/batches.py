@@ -1,4 +1,4 @@
-"""Batches drawn from tables, in an order that is a function of (seed, epoch).
+"""Batches drawn from clouds, in an order that is a function of (seed, epoch).
 
 There are no worker processes: a batch is one indexing into mapped files, and augmentation happens
 on the device. So there is nothing that the number of workers could change.
@@ -7,59 +7,15 @@ on the device. So there is nothing that the number of workers could change.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.random_views import RandomViews
+from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.utils.seeding import derive
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Clouds of one domain, with labels under the name of their owner, or without any.
-
-    Attributes:
-        clouds: n clouds.
-        labels: by owner ("y_source", "y_pseudo", "y_target_train"): [n] int64; often none at all.
-        balance: the owner whose classes are drawn equally often; None draws each cloud once.
-        beside: further clouds of the same objects, by their key in a batch (see
-            `qs3.datamodules.twins`); under "points" what comes in place of `clouds`.
-        repeated: further keys under which a batch has the very clouds of "points".
-    """
-
-    clouds: Clouds
-    labels: Mapping[str, Tensor]
-    balance: str | None = None
-    beside: Mapping[str, Clouds | RandomViews] = field(default_factory=dict)
-    repeated: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.clouds)
-
-    def rows(self, index: Tensor, draws: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
-        """The clouds (key "points") and labels at `index`, and what is beside them.
-
-        `draws`: by key what was drawn for these rows (`draw` of the clouds).
-        """
-        labels = {key: y[index] for key, y in self.labels.items()}
-        found = {key: some.take(index, draws.get(key)) for key, some in self.sources.items()}
-        return {**found, **{key: found["points"] for key in self.repeated}, **labels}
-
-    @property
-    def sources(self) -> dict[str, Any]:
-        """Where the clouds of each key come from, "points" first."""
-        return {"points": self.clouds, **self.beside}
-
-    def order(self, generator: torch.Generator) -> Int[Tensor, " n"]:
-        """As many positions as clouds: all of them, shuffled; or `balanced`."""
-        if self.balance is None:
-            return torch.randperm(len(self), generator=generator)
-        return balanced(self.labels[self.balance], generator)
 
 
 def balanced(classes: Int[Tensor, " n"], generator: torch.Generator) -> Int[Tensor, " n"]:
@@ -100,12 +56,12 @@ class Batches:
     Each cloud is seen in one of its samples, drawn anew each epoch.
 
     Args:
-        tables: by domain; the first decides the number of batches, the others are drawn from
-            again and again, each time in a new order.
+        parts: by domain; the first decides the number of batches, the others are drawn from
+            again and again, each time in a new order. Labels stand under their owner's name.
         batch_size: clouds of each domain in a batch. A last batch of one cloud (batch
             normalisation cannot use it) joins the one before.
         seed, epoch: of the run, and counted from 0.
-        shuffle: False keeps the tables' order, and each cloud's sample 0 (evaluation).
+        shuffle: False keeps the clouds' order, and each cloud's sample 0 (evaluation).
         rank, world: of `world` processes each takes every `world`-th cloud, as many as the others.
         piece: instead of one pass these batches, all of `batch_size`. Each cloud still comes once
             before any comes again.
@@ -114,7 +70,7 @@ class Batches:
 
     def __init__(
         self,
-        tables: Mapping[str, Table],
+        parts: Mapping[str, Clouds | Labelled],
         batch_size: int,
         *,
         seed: int,
@@ -125,11 +81,11 @@ class Batches:
         piece: Piece | None = None,
         pinned: bool = False,
     ) -> None:
-        self.tables = dict(tables)
+        self.parts = dict(parts)
         self.seed, self.epoch, self.shuffle = seed, epoch, shuffle
         self.rank, self.world = rank, world
         self.piece, self.pinned = piece, pinned
-        first = next(iter(self.tables.values()))
+        first = next(iter(self.parts.values()))
         if piece is None:
             self.sizes = _sizes(-(-len(first) // world), batch_size)
         else:
@@ -139,32 +95,36 @@ class Batches:
         return len(self.sizes)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        parts = {name: self._parts(name, table) for name, table in self.tables.items()}
+        by_name = {name: self._batches(name, part) for name, part in self.parts.items()}
         for i in range(len(self)):
             batch: dict[str, Any] = {"index": i, "epoch": self.epoch}
-            for name, table in self.tables.items():
-                index, draws = parts[name]
-                rows = table.rows(index[i], {key: some[i] for key, some in draws.items()})
+            for name, batches in by_name.items():
+                rows = next(batches)
                 batch[name] = {k: x.pin_memory() for k, x in rows.items()} if self.pinned else rows
             yield batch
 
-    def _parts(
-        self, name: str, table: Table
-    ) -> tuple[tuple[Tensor, ...], dict[str, tuple[Tensor, ...]]]:
-        """Positions [size] of each batch, and while training by key what is drawn for them."""
-        index = self._order(name, table)
-        draws = {}
-        if self.shuffle:
-            for key, clouds in table.sources.items():
-                use = (name,) if key == "points" else (name, key)
-                drawn = clouds.draw(len(table), self._generator("sample", *use, self.epoch))
-                if drawn is not None:
-                    draws[key] = drawn[index].split(self.sizes)
-        return index.split(self.sizes), draws
+    def _batches(self, name: str, part: Clouds | Labelled) -> Iterator[dict[str, Tensor]]:
+        """What comes of one domain, batch by batch."""
+        clouds = part if isinstance(part, Clouds) else part.clouds
+        index = self._order(name, part)
+        uses: dict[str, tuple[str, ...]] = {"points": (name,)}
+        if isinstance(part, Labelled) and part.again:
+            uses["again"] = (name, "again")
+        drawn = {}
+        for key, use in uses.items():
+            one = None
+            if self.shuffle:
+                one = clouds.draw(len(clouds), self._generator("sample", *use, self.epoch))
+            drawn[key] = [None] * len(self) if one is None else one[index].split(self.sizes)
+        for i, rows in enumerate(index.split(self.sizes)):
+            batch = {key: clouds.take(rows, starts[i]) for key, starts in drawn.items()}
+            if isinstance(part, Labelled):
+                batch[part.owner] = part.labels[rows]
+            yield batch
 
-    def _order(self, name: str, table: Table) -> Tensor:
+    def _order(self, name: str, part: Clouds | Labelled) -> Tensor:
         """This process's positions of the epoch: its share of one order after another."""
-        n, needed = len(table), sum(self.sizes)
+        n, needed = len(part), sum(self.sizes)
         each = -(-n // self.world)  # all processes take equally many: some clouds come twice
         begin = 0 if self.piece is None else self.piece.first * self.sizes[0]
         way: tuple[int | str, ...] = (self.epoch,)
@@ -172,10 +132,13 @@ class Batches:
             way = ("way", self.piece.way)
         shares = []
         for passed in range(begin // each, -(-(begin + needed) // each)):
-            if self.shuffle:
-                order = table.order(self._generator("shuffle", name, *way, passed))
-            else:
+            generator = self._generator("shuffle", name, *way, passed)
+            if not self.shuffle:
                 order = torch.arange(n)
+            elif isinstance(part, Labelled) and part.balanced:
+                order = balanced(part.labels, generator)
+            else:
+                order = torch.randperm(n, generator=generator)
             shares.append(
                 order.repeat(1 + self.world)[: each * self.world][self.rank :: self.world]
             )

@@ -2,17 +2,23 @@
 
 Nothing is copied until a batch asks for it: the stored clouds stay a memmap, and of the samples
 only the indices are kept. Processes that train on the same dataset share both in the page cache.
+
+Labels have owners. `Labelled` clouds may be trained on; `Clouds` have no labels to give.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
+
+from qs3.datamodules.fps_samples import farthest_points
+from qs3.store.store import PointSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +35,7 @@ class Clouds:
         scale: "unit_ball": a batch's clouds are divided by their radius; "metres": they are not;
             "above_floor": they are not, and z is the height above the floor, not the centroid.
         floor: z of the floor in `stored`; for "above_floor".
+        names: ids of all N; empty where there are none.
     """
 
     stored: Float[np.ndarray, "N P 3"]
@@ -38,6 +45,7 @@ class Clouds:
     rows: Int[np.ndarray, " n"]
     scale: str = "unit_ball"
     floor: float = 0.0
+    names: tuple[str, ...] = ()
 
     @staticmethod
     def of(
@@ -45,6 +53,7 @@ class Clouds:
         order: np.ndarray | None = None,
         scale: str = "unit_ball",
         floor: float = 0.0,
+        names: tuple[str, ...] = (),
     ) -> Clouds:
         """All of `stored`; its clouds are read once, for their balls (see `geometry.unit_ball`)."""
         centre = np.empty((len(stored), 3), dtype=np.float32)
@@ -53,11 +62,16 @@ class Clouds:
             moved = cloud - cloud[:1]
             centre[i] = moved.mean(axis=0)
             radius[i] = np.linalg.norm(moved - centre[i], axis=1).max() or 1.0
-        return Clouds(stored, order, centre, radius, np.arange(len(stored)), scale, floor)
+        return Clouds(stored, order, centre, radius, np.arange(len(stored)), scale, floor, names)
 
     def __len__(self) -> int:
         """How many there are."""
         return len(self.rows)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Of these n clouds."""
+        return tuple(self.names[row] for row in self.rows)
 
     @property
     def starts(self) -> int:
@@ -102,6 +116,109 @@ class Clouds:
             points[..., 2] += (first + centre)[:, None, 2] - np.float32(self.floor)
         return torch.from_numpy(np.asarray(points))
 
-    def all(self) -> Float[Tensor, "n m 3"]:
-        """All clouds in memory, each in its sample number 0: what evaluation sees."""
+    @property
+    def points(self) -> Float[Tensor, "n m 3"]:
+        """All clouds in memory, each in its sample number 0, as evaluation sees them; a copy."""
         return self.take(torch.arange(len(self)))
+
+    def all(self) -> Float[Tensor, "n m 3"]:
+        """The same."""
+        return self.points
+
+    @property
+    def clouds(self) -> Clouds:
+        """These."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """Clouds with labels that may be trained on.
+
+    Attributes:
+        clouds: n clouds.
+        labels: [n] int64, or [n, C] probabilities.
+        owner: their key in a batch: "y_source", "y_pseudo", "y_target_train"; "labels" for a
+            module of somebody else.
+        balanced: whether all classes are drawn equally often.
+        again: whether a batch has a second draw of each cloud, under the key "again".
+    """
+
+    clouds: Clouds
+    labels: Tensor
+    owner: str = "labels"
+    balanced: bool = False
+    again: bool = False
+
+    def __len__(self) -> int:
+        return len(self.clouds)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Of the clouds."""
+        return self.clouds.ids
+
+    def at(self, index: Int[np.ndarray, " k"]) -> Labelled:
+        """A part, by positions."""
+        part, labels = self.clouds.at(index), self.labels[torch.from_numpy(index)]
+        return dataclasses.replace(self, clouds=part, labels=labels)
+
+
+def prepare(
+    points: Float[np.ndarray, "n p 3"],
+    count: int,
+    *,
+    starts: int = 1,
+    cache_dir: Path | None = None,
+    key: str = "",
+    scale: str = "unit_ball",
+    floor: float = 0.0,
+    names: tuple[str, ...] = (),
+) -> Clouds:
+    """Each cloud about its centroid, and of it `starts` samples of `count` farthest points.
+
+    A cloud is not normalised again after sampling. Evaluation takes sample 0. Which points are
+    farthest does not depend on a cloud's size: all scales share the cached indices.
+
+    Args:
+        points: clouds as stored, e.g. a memmap; kept, not copied.
+        count: points to keep, at most p. If it is p there is nothing to choose.
+        starts, cache_dir, key: see `farthest_points`.
+        scale, floor, names: of the clouds, see `Clouds`.
+    """
+    order = farthest_points(points, count, starts, cache_dir, key)
+    return Clouds.of(points, order, scale, floor, names)
+
+
+def load_clouds(
+    dataset: PointSet,
+    split: str,
+    points: int,
+    starts: int = 1,
+    cache_dir: Path | None = None,
+    *,
+    scale: str,
+) -> Clouds:
+    """A split's clouds, prepared (see `prepare`), without their labels.
+
+    `scale` has no default: without it a net would silently see clouds of another size.
+    """
+    part = dataset.split(split)
+    assert scale != "above_floor" or dataset.floor_m is not None
+    return prepare(
+        part.points,
+        points,
+        starts=starts,
+        cache_dir=cache_dir,
+        key=f"{dataset.name}-{dataset.sha256[:16]}-{split}",
+        scale=scale,
+        floor=dataset.floor_m or 0.0,
+        names=part.ids,
+    )
+
+
+def labels_of(dataset: PointSet, split: str) -> Int[Tensor, " n"] | None:
+    """A split's labels, for those who may have them; None if the dataset has none."""
+    if not dataset.labelled:
+        return None
+    return torch.from_numpy(np.array(dataset.labels[dataset.indices(split)]))

@@ -1,20 +1,29 @@
-"""Several farthest point samples of each cloud, by several processes.
+"""Which points of each stored cloud a net sees: farthest point sampling, done once, cached.
 
-Imports no torch, so that they need not.
+The lineage samples in every access, from a random point. Here each cloud is sampled from a few
+points once, by several processes, and an epoch draws one of these samples for each cloud: it costs
+an index. Imports no torch, so that the processes need not.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
+from qs3.utils.files import atomic_path
+from qs3.utils.locks import locked
 from qs3.utils.pool import Processes
 from qs3.utils.progress import shown
 from qs3.utils.seeding import derive
@@ -23,6 +32,56 @@ log = logging.getLogger(__name__)
 
 _CHUNK = 64  # clouds that a process samples at a time
 WORTH_A_PROCESS = 2000  # samples; about 2 s of work
+_DAY = 24 * 3600  # seconds
+_VERSION = 2  # of the cache: raise it when the samples would be others
+_DIGEST = hashlib.sha256().digest_size
+
+
+def farthest_points(
+    points: Float[np.ndarray, "n p 3"],
+    count: int,
+    starts: int = 1,
+    cache_dir: Path | None = None,
+    key: str = "",
+) -> Int[np.ndarray, "n starts count"] | None:
+    """`starts` samples of `count` farthest points of each cloud; None if `count` is p.
+
+    Sample 0 begins at point 0, the others at points that are a function of the cloud's bytes
+    (`start_points`). Nothing is random, so evaluation is deterministic.
+
+    Args:
+        points: clouds as stored.
+        count: points to keep, at most p.
+        starts: samples of each cloud; at most p are taken.
+        cache_dir: where to keep the indices for the next run; None keeps nothing.
+        key: names the clouds: the dataset with its hash, and the split.
+
+    Raises:
+        ConfigError: the clouds have fewer points than asked for.
+    """
+    n, stored, _ = points.shape
+    if not 1 <= count <= stored:
+        raise ConfigError(f"data.points is {count}, but the clouds of {key} have {stored} points")
+    if count == stored:
+        return None
+    starts = min(starts, stored)
+
+    def work() -> np.ndarray:
+        log.info("sampling %d of %d points of %d clouds, %dx (%s)", count, stored, n, starts, key)
+        return sample_all(points, count, starts)
+
+    if cache_dir is None:
+        return work()
+    cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
+    name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
+    shape = (n, starts, count)
+    order = read_array(cache, shape, name)
+    if order is None:
+        with _alone(cache_dir):  # seeds that start at the same time wait for the first
+            order = read_array(cache, shape, name)
+            if order is None:
+                order = keep_array(cache, work(), name)
+    return order
 
 
 def start_points(cloud: Float[np.ndarray, "p 3"], starts: int) -> list[int]:
@@ -56,10 +115,7 @@ def sample(
 
 
 def sample_all(
-    points: Float[np.ndarray, "n p 3"],
-    count: int,
-    starts: int,
-    processes: int | None = None,
+    points: Float[np.ndarray, "n p 3"], count: int, starts: int, processes: int | None = None
 ) -> Int[np.ndarray, "n starts count"]:
     """The same, with a progress bar on a terminal, and by several processes if it takes long.
 
@@ -98,3 +154,56 @@ def _sampler(count: int, starts: int) -> Callable[[np.ndarray], np.ndarray]:
 
 def _index_type(points: int) -> type[np.signedinteger]:
     return np.int16 if points <= np.iinfo(np.int16).max else np.int32
+
+
+def remove_old_leftovers(cache_dir: Path) -> None:
+    """Delete what killed processes have left half written: if a day old, for others write here."""
+    for path in cache_dir.glob(".*.npy.*.tmp.npy"):
+        with contextlib.suppress(OSError):  # another run was quicker, or may and we may not
+            if time.time() - path.stat().st_mtime > _DAY:
+                path.unlink()
+
+
+# The cache's file is an .npy with 32 bytes after it: SHA-256 of what it is and of what it holds.
+
+
+def read_array(path: Path, shape: tuple[int, ...], name: str) -> np.ndarray | None:
+    """A cached array as a memmap; None if it is not there, damaged, or of another version."""
+    if not path.is_file():
+        return None
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        with open(path, "rb") as file:
+            file.seek(-_DIGEST, os.SEEK_END)
+            digest = file.read()
+    except Exception:  # numpy's parser of headers raises whatever Python's does
+        return None
+    return array if array.shape == shape and digest == _digest(array, name) else None
+
+
+def keep_array(path: Path, order: np.ndarray, name: str) -> np.ndarray:
+    """The array from the cache, after writing it there; from memory if that is not possible."""
+    try:
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            np.save(file, order, allow_pickle=False)
+            file.write(_digest(order, name))
+    except Qs3Error as error:  # others' folder, a full disk
+        log.warning("%s (data.cache_dir=null keeps none)", error)
+        return order
+    kept = read_array(path, order.shape, name)
+    return order if kept is None else kept
+
+
+def _digest(order: np.ndarray, name: str) -> bytes:
+    digest = hashlib.sha256(f"{name} {order.shape} {order.dtype.str}".encode())
+    digest.update(np.ascontiguousarray(order).data)
+    return digest.digest()
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the cache's lock if there can be one; without it, at worst the work is done twice."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(Qs3Error, OSError):
+            stack.enter_context(locked(folder / ".lock"))
+        yield

@@ -8,20 +8,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Interval
 from jaxtyping import Float
 
-from qs3.config.checks import check_choice, check_float, check_int
 from qs3.errors import ConfigError
-from qs3.utils.plural import counted
-
-LOWER_THETA = "lower selftraining.theta"
-"""What selects more where a scheme has nothing else for it, in messages."""
-
-RAISE_SHARE = "raise selftraining.share"
-"""The same of a scheme whose threshold is set by a share."""
+from qs3.utils.settings import settings
 
 
 @dataclass(frozen=True)
@@ -43,12 +37,6 @@ class Phases:
     epochs: int = 0
     warmup_steps: int | None = None
     round_steps: int | None = None
-
-    def __post_init__(self) -> None:
-        check_int("protocol.epochs", self.warmup, 1)
-        _check_steps("protocol", self.warmup_steps, self.warmup)
-        if self.rounds:
-            _check_steps("selftraining", self.round_steps, self.epochs)
 
     @property
     def total(self) -> int:
@@ -95,32 +83,7 @@ class Phases:
         return 0.5 * (1.0 + math.cos(math.pi * (epoch - start) / (stop - start)))
 
 
-def plain_epochs(plain: float, epochs: int) -> int:
-    """The first epoch with a pool (`method=pcfea`): ceil(plain epochs), in decimal arithmetic.
-
-    So 0.07 of 100 epochs are 7, whose product in binary is just above.
-
-    Raises:
-        ConfigError: there is none among the `epochs`.
-    """
-    first = math.ceil(Decimal(repr(float(plain))) * epochs)
-    if first >= epochs:
-        raise ConfigError(
-            f"method.plain={plain} of protocol.epochs={epochs}, rounded up, is all of them: "
-            "method=pcfea would make no pool and be source_only under another name; give more "
-            "protocol.epochs or a lower method.plain, or set method=source_only"
-        )
-    return first
-
-
-def _check_steps(group: str, steps: int | None, epochs: int) -> None:
-    if steps is not None and check_int(f"{group}.steps", steps, 1) < epochs:
-        raise ConfigError(
-            f"{group}.steps={steps} must be at least {group}.epochs={epochs}, one an epoch"
-        )
-
-
-@dataclass(frozen=True)
+@settings
 class SelfTrainingConfig:
     """The settings of config group `selftraining`.
 
@@ -130,13 +93,14 @@ class SelfTrainingConfig:
         epochs: of each round.
         steps: batches of each round, spread over its epochs, however many pseudo-labels there are;
             None: an epoch is one pass over them.
-        batch_size: of each round.
+        batch_size: of each round; batch norm needs two clouds.
         theta: confidence that a pseudo-label must exceed, in round 0; 0 is for selectors that have
-            thresholds of their own (CBST), and for them alone.
+            thresholds of their own (CBST).
         epsilon: added to theta in each further round.
-        share: instead of theta and epsilon, of each round's predictions the share that exceeds its
-            threshold: where nets are unsure of everything, 0.8 says nothing. None: theta.
-        init: "scratch" draws new weights each round; "continue" begins round 0 with the weights of
+        share: instead of theta and epsilon, the share of each round's predictions that exceeds its
+            threshold: where nets are unsure of everything, 0.8 selects next to nothing. None:
+            theta.
+        init: weights a round begins with. "scratch" draws new ones; "continue" begins round 0 with
             the teacher that labelled it, and each further round with the student before;
             "persistent" draws new weights in round 0 alone, and keeps them and the optimiser's
             moments from then on, as in QS3's released code.
@@ -147,77 +111,30 @@ class SelfTrainingConfig:
         mrkld: weight of CRST's regulariser (see `qs3.selftraining.student_loss`); 0 is none.
         missing_class: what to do if a class has no pseudo-label: "warn" or "error".
         rehearsal: train on all target samples, whatever the selector keeps (`debug=fast`).
+
+    Raises:
+        ConfigError: losses would have a weight of 0 or less in the last epochs.
     """
 
     selector: Any = None
-    rounds: int = 0
-    epochs: int = 10
-    steps: int | None = None
-    batch_size: int = 32
-    theta: float = 0.8
+    rounds: Annotated[int, Ge(0)] = 0
+    epochs: Annotated[int, Ge(1)] = 10
+    steps: Annotated[int, Ge(1)] | None = None
+    batch_size: Annotated[int, Ge(2)] = 32
+    theta: Annotated[float, Interval(ge=0, lt=1)] = 0.8
     epsilon: float = 0.0
-    share: float | None = None
-    init: str = "scratch"
+    share: Annotated[float, Interval(gt=0, lt=1)] | None = None
+    init: Literal["scratch", "continue", "persistent"] = "scratch"
     use_source: bool = False
     pcm: bool = False
-    weight_step: float = 0.0
-    mrkld: float = 0.0
-    missing_class: str = "warn"
+    weight_step: Annotated[float, Ge(0)] = 0.0
+    mrkld: Annotated[float, Ge(0)] = 0.0
+    missing_class: Literal["warn", "error"] = "warn"
     rehearsal: bool = False
 
     def __post_init__(self) -> None:
-        check_int("selftraining.rounds", self.rounds, 0)
-        if self.rounds == 0:
-            return
-        if not hasattr(self.selector, "select"):
-            raise ConfigError("selftraining.rounds > 0 needs a selector, e.g. selftraining=qbst")
-        check_int("selftraining.epochs", self.epochs, 1)
-        check_int("selftraining.batch_size", self.batch_size, 2)  # batch norm needs two clouds
-        check_choice("selftraining.init", self.init, ("scratch", "continue", "persistent"))
-        check_choice("selftraining.missing_class", self.missing_class, ("warn", "error"))
-        check_float("selftraining.epsilon", self.epsilon)
-        if getattr(self.selector, "begins_weightless", False) and not self.use_source:
-            raise ConfigError(
-                "selftraining.selector.unsure=0 and selftraining.use_source=false: in round 0 no "
-                "label is sure, all weigh nothing, and the next teacher would have learnt nothing; "
-                "set selftraining.use_source=true, or selftraining.selector.unsure above 0"
-            )
-        free = bool(getattr(self.selector, "own_thresholds", False)) and self.theta == 0
-        check_float("selftraining.theta", self.theta, "" if free else "(0, 1)")
-        if self.share is not None:
-            check_float("selftraining.share", self.share, "(0, 1)")
-            if free:
-                raise ConfigError(
-                    "selftraining.share sets a threshold for all classes, and this selector has "
-                    "its own; set selftraining.share=null"
-                )
-        check_float("selftraining.mrkld", self.mrkld, ">= 0")
-        epochs = self.rounds * self.epochs
-        step = check_float("selftraining.weight_step", self.weight_step)
-        if not 0.0 <= step * (epochs - 1) < 1.0:
-            raise ConfigError(
-                "selftraining.weight_step must be >= 0, and below 1 after "
-                f"{counted(epochs - 1, 'epoch')}, got {self.weight_step}"
-            )
-        last = self.theta_of(self.rounds - 1)
-        if not (0.0 < last < 1.0 or (free and last == 0)):
-            raise ConfigError(
-                f"selftraining.theta + epsilon * (rounds - 1) must lie in (0, 1), got {last} "
-                f"(theta={self.theta}, epsilon={self.epsilon}, rounds={self.rounds})"
-            )
-
-    @property
-    def more_labels(self) -> tuple[str, ...]:
-        """What would select more, as messages advise it: of the threshold, of the selector."""
-        own = getattr(self.selector, "more_labels", None)
-        threshold = LOWER_THETA if self.share is None else RAISE_SHARE
-        # At 0 there is no other threshold than the selector's, if it has any.
-        return tuple(way for way in (threshold if self.theta else None, own) if way)
-
-    @property
-    def instead_of_mu(self) -> str | None:
-        """What selects more where one class alone is confident; None: the selector has no mu."""
-        return getattr(self.selector, "instead_of_mu", None)
+        if self.weight_step * (self.rounds * self.epochs - 1) >= 1:
+            raise ConfigError(f"selftraining.weight_step={self.weight_step} falls to 0 in training")
 
     def theta_of(self, round_: int, confidence: Float[np.ndarray, " n"] | None = None) -> float:
         """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly.

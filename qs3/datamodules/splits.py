@@ -1,90 +1,81 @@
-"""A split's clouds as training may see them: with labels, or without any that it could reach.
+"""Which training clouds a run has, and which validate: functions of ids and labels, not of chance.
 
-Labels have owners. `Labelled` clouds may be trained on; `Unlabelled` ones have no labels to give.
+Further scans of an object (`generate.py scans=N` calls them id~1, id~2, ...) go where it goes:
+else training would see the validation shapes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+import re
+from collections.abc import Sequence
+from types import MappingProxyType
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+from jaxtyping import Int
 
-from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.fps_cache import prepare
-from qs3.errors import ConfigError
+from qs3.errors import DataError
 from qs3.store.store import PointSet, evenly
+from qs3.utils.seeding import derive
+
+STRATIFIED_SEED = 0
+STRATIFIED_SHARE = 0.2  # of each class's objects, as large as the lineage's part
+
+_FURTHER_SCAN = re.compile(r"~\d+$")
 
 
-@dataclass(frozen=True, eq=False)
-class Unlabelled:
-    """n clouds with their ids."""
+def lineage(
+    ids: Sequence[str], labels: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " v"]]:
+    """(train, validation): of the objects sorted by id, positions with i % 10 >= 8 validate.
 
-    clouds: Clouds
-    ids: tuple[str, ...]
-
-    @property
-    def points(self) -> Float[Tensor, "n m 3"]:
-        """The clouds in memory as evaluation sees them; made anew each time."""
-        return self.clouds.all()
-
-
-@dataclass(frozen=True, eq=False)
-class Labelled:
-    """n clouds with their ids and labels [n] int64."""
-
-    clouds: Clouds
-    ids: tuple[str, ...]
-    labels: Int[Tensor, " n"]
-
-    def at(self, index: np.ndarray) -> Labelled:
-        """A part."""
-        ids = tuple(self.ids[i] for i in index)
-        return Labelled(self.clouds.at(index), ids, self.labels[torch.from_numpy(index)])
-
-
-def load_clouds(
-    dataset: PointSet,
-    split: str,
-    points: int,
-    starts: int = 1,
-    cache_dir: Path | None = None,
-    *,
-    scale: str,
-) -> Unlabelled:
-    """A split's clouds, prepared (see `prepare`), without their labels.
-
-    `scale` has no default: who forgot it would show a net clouds of another size, and no error.
+    The rule of DefRec, GAST and QS3. Ids begin with the class, so each class is split about 4 : 1.
 
     Raises:
-        ConfigError: heights above a floor are asked for, and nobody knows where it is.
+        DataError: fewer than nine objects, so that there is nothing to validate on.
     """
-    if scale == "above_floor" and dataset.floor_m is None:
-        raise ConfigError(
-            f"{dataset.name}: nobody knows where the floor is (floor_m of its domain)"
-        )
-    part = dataset.split(split)
-    key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
-    clouds = prepare(
-        part.points,
-        points,
-        starts=starts,
-        cache_dir=cache_dir,
-        key=key,
-        scale=scale,
-        floor=dataset.floor_m or 0.0,
-    )
-    return Unlabelled(clouds, part.ids)
+    objects, place = _objects(ids)
+    order = np.argsort(np.array(ids), kind="stable")
+    validates = place[order] % 10 >= 8
+    if not validates.any():
+        raise DataError(f"{len(objects)} labelled training objects: data.val=lineage needs 9")
+    return order[~validates], order[validates]
 
 
-def labels_of(dataset: PointSet, split: str) -> Int[Tensor, " n"] | None:
-    """A split's labels, for those who may have them; None if the dataset has none."""
-    if not dataset.labelled:
-        return None
-    return torch.from_numpy(np.array(dataset.labels[dataset.indices(split)]))
+def stratified(
+    ids: Sequence[str], labels: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " v"]]:
+    """(train, validation): of each class a fifth of its objects validates, rounded, at least one.
+
+    They are the first by a hash of (`STRATIFIED_SEED`, id), so the split is the same for every run
+    and order of clouds. The only object of a class trains. Both parts are sorted by id.
+
+    Raises:
+        DataError: no class has two objects.
+    """
+    objects, place = _objects(ids)
+    cls = np.full(len(objects), -1)
+    cls[place] = labels
+    assert (cls[place] == labels).all(), "scans of an object with labels of two classes"
+    rank = np.array([derive(STRATIFIED_SEED, "validation", str(name)) for name in objects])
+    validates = np.zeros(len(objects), dtype=bool)
+    for label in np.unique(cls):
+        members = np.flatnonzero(cls == label)
+        if len(members) > 1:
+            count = max(1, round(STRATIFIED_SHARE * len(members)))
+            validates[members[np.argsort(rank[members])][:count]] = True
+    if not validates.any():
+        raise DataError("data.val=stratified needs a class with two labelled training objects")
+    order = np.argsort(np.array(ids), kind="stable")
+    chosen = validates[place[order]]
+    return order[~chosen], order[chosen]
+
+
+def _objects(ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The objects' names, sorted, and of each cloud which object it shows."""
+    return np.unique([_FURTHER_SCAN.sub("", name) for name in ids], return_inverse=True)
+
+
+RULES = MappingProxyType({"lineage": lineage, "stratified": stratified})
 
 
 def subsample_splits(dataset: PointSet, count: int) -> PointSet:

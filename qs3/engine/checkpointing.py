@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,9 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import CheckpointIO
 
-from qs3.errors import DataError
 from qs3.runs.checkpoints import LAST, load, save
 from qs3.runs.metrics import Times
-from qs3.utils.memory import forget_peak, peak_bytes
 from qs3.utils.processor_time import Moment, processor_seconds
-
-_LIGHTNINGS = "pytorch-lightning_version"  # what every checkpoint of its trainer has
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -33,10 +30,7 @@ class AtomicCheckpointIO(CheckpointIO):
         self, path: Any, map_location: Any | None = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
         """Read `path`, never a pickle of arbitrary objects."""
-        found = load(path, "cpu" if map_location is None else map_location)
-        if not isinstance(found, dict) or _LIGHTNINGS not in found:
-            raise DataError(f"{path} holds something else than a run; start again with force=true")
-        return found
+        return load(path, "cpu" if map_location is None else map_location)
 
     def remove_checkpoint(self, path: Any) -> None:
         """Delete `path`."""
@@ -71,50 +65,39 @@ class Clock(Callback):
 
     def __init__(self, began: Moment) -> None:
         self.began = began
-        self.before = 0.0
-        self.cores_before: float | None = 0.0  # None: a start did not count them
+        self.before = Moment(0.0, 0.0)
         self.peaks = {"memory": 0, "gpu": 0}
-        forget_peak()
         if torch.cuda.is_available():
             torch.cuda.reset_peak_memory_stats()
 
-    def seconds(self) -> float:
-        """Wall time so far."""
-        return self.before + time.time() - self.began.wall
-
-    def core_seconds(self) -> float | None:
-        """Processor time so far; None if it is not known of an earlier start."""
-        if self.cores_before is None:
-            return None
-        return self.cores_before + max(0.0, processor_seconds() - self.began.cores)
-
     def taken(self) -> Times:
         """What the run has taken so far."""
-        gb = {name: round(peak / 1e9, 3) or None for name, peak in self._now().items()}
-        cores = self.core_seconds()
+        now, peaks = self._so_far(), self._peaks()
         return Times(
-            seconds=round(self.seconds(), 1),
-            core_seconds=None if cores is None else round(cores, 1),
-            memory_gb=gb["memory"],
-            gpu_memory_gb=gb["gpu"],
+            seconds=round(now.wall, 1),
+            core_seconds=round(now.cores, 1),
+            memory_gb=round(peaks["memory"] / 1e9, 3) or None,
+            gpu_memory_gb=round(peaks["gpu"] / 1e9, 3) or None,
         )
 
     def state_dict(self) -> dict[str, Any]:
         """Seconds and bytes so far."""
-        return {
-            "seconds": self.seconds(),
-            "core_seconds": self.core_seconds(),
-            "peaks": self._now(),
-        }
+        now = self._so_far()
+        return {"seconds": now.wall, "core_seconds": now.cores, "peaks": self._peaks()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take over what earlier starts took."""
-        self.before = float(state_dict["seconds"])
-        self.cores_before = state_dict.get("core_seconds")  # of older versions: none
+        self.before = Moment(state_dict["seconds"], state_dict["core_seconds"])
         self.peaks |= state_dict["peaks"]
 
-    def _now(self) -> dict[str, int]:
+    def _so_far(self) -> Moment:
+        """Wall and processor time in seconds."""
+        cores = max(0.0, processor_seconds() - self.began.cores)
+        return Moment(self.before.wall + time.time() - self.began.wall, self.before.cores + cores)
+
+    def _peaks(self) -> dict[str, int]:
         """Bytes at most, in the process and on its GPU; 0 for what is not known."""
         gpu = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
-        now = {"memory": peak_bytes() or 0, "gpu": gpu}
+        kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        now = {"memory": 1024 * kib, "gpu": gpu}
         return {name: max(peak, self.peaks[name]) for name, peak in now.items()}

@@ -14,7 +14,6 @@ from qs3.datamodules.batches import generator_of
 from qs3.datamodules.phases import Phases
 from qs3.engine.cuda_graphs import Graphs
 from qs3.engine.schedules import Plateau, cosine
-from qs3.errors import ConfigError
 from qs3.kernels.norms import use_trained
 from qs3.methods.base import Method, total_loss
 from qs3.models.base import Backbone, PointClassifier
@@ -99,10 +98,7 @@ class Classifier(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """One optimiser, one schedule."""
-        try:
-            optimizer = self._optimizer()
-        except (TypeError, ValueError) as error:  # e.g. a negative learning rate
-            raise ConfigError(f"protocol.optimizer: {error}") from error
+        optimizer = self._optimizer()
         if self.schedule == "plateau":
             self._plateau = Plateau(optimizer)
             return optimizer

@@ -22,7 +22,6 @@ from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import DataError
 from qs3.utils.files import write_text
-from qs3.utils.memory import TABLE_PEAK, read_whole
 
 
 class EpochRows(Callback):
@@ -113,13 +112,9 @@ class CsvHistory(Logger):
         if not self.path.is_file():
             return []
         try:
-            text = read_whole(self.path, TABLE_PEAK).decode()
-            rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
-            if not all(row["epoch"].isdecimal() and None not in row for row in rows):
-                raise ValueError("a row that is not of an epoch")
-        except (OSError, ValueError, KeyError, AttributeError, csv.Error) as error:
-            raise DataError(
-                f"{self.path} is damaged ({error}); delete it, and the same command goes on "
-                "without the rows of earlier epochs"
-            ) from error
+            rows = list(csv.DictReader(io.StringIO(self.path.read_text("utf-8")), strict=True))
+            for row in rows:
+                int(row["epoch"])
+        except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+            raise DataError(f"{self.path} is damaged ({error})") from error
         return rows

@@ -16,18 +16,32 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from qs3.utils.allocator import keep_freed_memory
 
+_OURS = ("threads", "gpus", "cuda_graphs", "float32_matmul")
+
 
 def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
     """Lightning's trainer by config group `trainer`; `more`: arguments that follow from the run.
 
     Raises:
-        ConfigError: Lightning does not take the settings.
+        ConfigError: Lightning does not take the settings, or a run cannot have them.
     """
+    settings: Any = OmegaConf.to_container(cfg.trainer, resolve=True)
+    given = {key: value for key, value in settings.items() if key not in _OURS}
+    if isinstance(given.get("profiler"), dict):
+        given["profiler"] = build(cfg.trainer.profiler)
     try:
-        return Trainer(**_trainer_settings(cfg), **more)
+        return Trainer(
+            **given,
+            **more,
+            reload_dataloaders_every_n_epochs=1,  # each epoch has its own order; rounds, their set
+            use_distributed_sampler=False,  # `Batches` shares the clouds out itself
+            num_sanity_val_steps=0,
+            log_every_n_steps=1,
+            enable_progress_bar=False,  # `qs3.engine.progress` shows all epochs in one bar
+            enable_model_summary=False,
+        )
     except (MisconfigurationException, TypeError, ValueError) as error:
-        hint = "" if cfg.trainer.accelerator == "cpu" else "; without a GPU use trainer=cpu"
-        raise ConfigError(f"trainer: {error}{hint}") from error
+        raise ConfigError(f"trainer: {error}") from error
 
 
 def let_weights_rest(trainer: Trainer) -> None:
@@ -37,23 +51,6 @@ def let_weights_rest(trainer: Trainer) -> None:
     """
     if isinstance(trainer.strategy, DDPStrategy):
         trainer.strategy._ddp_kwargs["find_unused_parameters"] = True
-
-
-def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
-    settings = OmegaConf.to_container(cfg.trainer, resolve=True)
-    assert isinstance(settings, dict)
-    ours = ("threads", "gpus", "cuda_graphs", "float32_matmul")
-    given = {str(key): value for key, value in settings.items() if key not in ours}
-    if isinstance(given.get("profiler"), dict):
-        given["profiler"] = build(cfg.trainer.profiler)
-    return given | {
-        "reload_dataloaders_every_n_epochs": 1,  # each epoch has its own order; rounds, their set
-        "use_distributed_sampler": False,  # `Batches` shares the clouds out itself
-        "num_sanity_val_steps": 0,
-        "log_every_n_steps": 1,
-        "enable_progress_bar": False,  # `qs3.engine.progress` shows all epochs in one bar
-        "enable_model_summary": False,
-    }
 
 
 def build_each(group: DictConfig | None) -> list[Any]:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.datamodules.augment import rotate_z
-from qs3.datamodules.splits import Unlabelled
+from qs3.datamodules.clouds import Clouds
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.calibration import calibration_error
 from qs3.kernels.norms import adapt_batchnorm, use_trained
@@ -190,7 +190,7 @@ class Evaluation:
 
     def __init__(
         self,
-        test: Unlabelled,
+        test: Clouds,
         labels: Int[Tensor, " n"] | None,
         train_labels: Mapping[str, int] | None,
         classes: Sequence[str],

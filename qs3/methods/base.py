@@ -19,7 +19,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ class Method(nn.Module):
     Attributes:
         labels: whose labels it trains on: "source", or "target_train" (the upper bound only).
         uses_target: whether its batches hold unlabelled target clouds.
-        wants: what they hold beside clouds and labels: twins, second draws; nothing by default.
+        again: whether they hold a second draw of each source cloud, under the key "again".
         smoothing: of class labels (`class_loss`); the trainer sets it to `protocol.smoothing`.
         metres: whether clouds keep their size (`data.scale`); the trainer says so. A loss with
             lengths in it divides by each cloud's size then.
@@ -44,7 +43,7 @@ class Method(nn.Module):
 
     labels: ClassVar[str] = "source"
     uses_target: ClassVar[bool] = False
-    wants: Wants = Wants()
+    again: ClassVar[bool] = False
     smoothing: float = 0.0
     metres: bool = False
 

@@ -105,7 +105,7 @@ def random_batch(method: Method, classes: int, points: int) -> dict[str, Any]:
         return drawn / drawn.norm(dim=2).amax(dim=1)[:, None, None]
 
     source = {"points": clouds(), f"y_{method.labels}": torch.arange(_CLOUDS) % classes}
-    if method.wants.again:
+    if method.again:
         source["again"] = clouds()
     batch: dict[str, Any] = {"index": 0, "epoch": 0, "progress": 0.5, "source": source}
     if method.uses_target:

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from qs3.datamodules.twins import Wants
 from qs3.methods.base import Method, Weight, class_loss
 from qs3.utils.settings import checked
 
@@ -19,15 +18,14 @@ from qs3.utils.settings import checked
 class Twin(Method):
     """L = CE(f(x), y) + b CE(f(x'), y).
 
-    x: a source cloud, noisy, hidden and cut; x': x drawn again, turned alike, by another cut and,
-    with `data.source.views=random`, another share of its sensor's error and number of views; f:
-    class probabilities of the net.
+    x: a source cloud, noisy, hidden and cut; x': x drawn again, turned alike, with another cut;
+    f: class probabilities of the net.
 
     Args:
         again_weight: b.
     """
 
-    wants = Wants(again=True)
+    again = True
 
     @checked
     def __init__(self, again_weight: Weight = 1.0) -> None:

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.fps_cache import keep_array, read_array
+from qs3.datamodules.fps_samples import keep_array, read_array
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.kernels.device import exporting
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier

@@ -202,7 +202,7 @@ def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[st
     "Before" are the weights that the warm-up selected, "after" those of the result: without rounds
     they are the same, and there is one panel. Which clouds follows from the run's seed.
     """
-    from qs3.datamodules.splits import load_clouds
+    from qs3.datamodules.clouds import load_clouds
     from qs3.evaluation.metrics import global_features
     from qs3.inference.model_file import PACKAGES, build_net, read_result
     from qs3.runs.checkpoints import load

@@ -42,7 +42,6 @@ from qs3.selftraining.selectors import (
     Selection,
     TeacherPredictions,
     check_selection,
-    check_teacher,
     chosen_by,
     keep_all,
 )
@@ -114,21 +113,15 @@ class SelfTraining(Callback):
         phases: of the run.
         scheme: settings of the rounds.
         classes: names in label order.
-        given: whether the first teacher was given, so that no warm-up makes it better.
 
     Attributes:
         records: what `metrics.json` says about each round so far.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        phases: Phases,
-        scheme: SelfTrainingConfig,
-        classes: Sequence[str],
-        given: bool = False,
+        self, folder: Path, phases: Phases, scheme: SelfTrainingConfig, classes: Sequence[str]
     ) -> None:
-        self.folder, self.phases, self.scheme, self._given = folder, phases, scheme, given
+        self.folder, self.phases, self.scheme = folder, phases, scheme
         self.classes = tuple(classes)
         self.records: list[RoundRecord] = []
         self._previous: Int[Tensor, " n"] | None = None  # [n] predicted labels of the round before
@@ -161,35 +154,26 @@ class SelfTraining(Callback):
         """Label the target, choose, keep the table, and hand the next training set to the data."""
         data = trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(data, AdaptationData)
-        said = self._predictions(trainer, pl_module, data, round_)
-        check_teacher(said, round_, trainable=not self._given)
-        theta = self.scheme.theta_of(round_, said.confidence)
-        selection = chosen_by(self.scheme.selector, said, theta, round_)
+        teacher = self._predictions(trainer, pl_module, data, round_)
+        theta = self.scheme.theta_of(round_, teacher.confidence)
+        selection = chosen_by(self.scheme.selector, teacher, theta, round_)
         if selection.labels is not None:  # a selector may name another class than the most probable
-            said = said.relabelled(selection.labels)
+            teacher = teacher.relabelled(selection.labels)
         if self.scheme.rehearsal:
-            selection = keep_all(selection, said.predicted)
+            selection = keep_all(selection, teacher.predicted)
         if trainer.is_global_zero:
             write_pseudo_labels(
                 path_of(self.folder, round_),
-                said.ids,
-                said.predicted,
-                said.confidence,
+                teacher.ids,
+                teacher.predicted,
+                teacher.confidence,
                 selection.selected,
                 self.classes,
             )
         missing = check_selection(
-            selection,
-            self.classes,
-            round_,
-            self.scheme.missing_class,
-            more=self.scheme.more_labels,
-            longer=self._longer(round_),
-            instead_of_mu=self.scheme.instead_of_mu,
-            processes=trainer.world_size,
+            selection, self.classes, round_, self.scheme.missing_class, trainer.world_size
         )
-
-        labels = torch.from_numpy(said.predicted)
+        labels = torch.from_numpy(teacher.predicted)
         index = torch.from_numpy(selection.selected.nonzero()[0])
         if selection.soft is None:
             data.set_pseudo_labels(index, labels[index])
@@ -199,14 +183,6 @@ class SelfTraining(Callback):
         self._previous = labels
         if trainer.is_global_zero:
             _log(self.records[-1], len(labels))
-
-    def _longer(self, round_: int) -> str | None:
-        """What trains the teacher of a round for longer: the warm-up's net, then the students."""
-        if round_ == 0 and self._given:
-            return None
-        steps = self.phases.round_steps if round_ else self.phases.warmup_steps
-        group = "selftraining" if round_ else "protocol"
-        return f"{group}.epochs" if steps is None else f"{group}.steps"
 
     def _predictions(
         self, trainer: Trainer, pl_module: Classifier, data: AdaptationData, round_: int

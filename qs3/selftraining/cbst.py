@@ -8,18 +8,15 @@ about pixels; what is done here with clouds is said in the docstrings.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from decimal import Decimal
-from typing import ClassVar
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Interval
 from jaxtyping import Float, Int
 
-from qs3.config.checks import check_choice, check_float, check_of_use, check_ranges
-from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, TeacherPredictions
-
-_KEY = "selftraining.selector"
+from qs3.utils.settings import settings
 
 
 def class_thresholds(
@@ -41,7 +38,7 @@ def class_thresholds(
     return thresholds
 
 
-@dataclass(frozen=True)
+@settings
 class Cbst:
     r"""Class-balanced self-training: about the same portion of each predicted class.
 
@@ -64,26 +61,11 @@ class Cbst:
         alpha: weight of LRENT's entropy; 0.25 in the released code.
     """
 
-    own_thresholds: ClassVar[bool] = True
-    more_labels: ClassVar[str] = f"raise {_KEY}.portion and .most"
-
-    portion: float = 0.2
-    step: float = 0.05
-    most: float = 0.5
-    labels: str = "hard"
-    alpha: float = 0.25
-
-    def __post_init__(self) -> None:
-        check_choice(f"{_KEY}.labels", self.labels, ("hard", "lrent"))
-        for key in ("portion", "step", "most", "alpha"):
-            check_float(f"{_KEY}.{key}", getattr(self, key))
-        if not 0 < self.portion <= self.most <= 1:
-            raise ConfigError(
-                f"{_KEY}: 0 < portion <= most <= 1, got portion={self.portion}, most={self.most}"
-            )
-        check_ranges(self, f"{_KEY}.", step=">= 0", alpha="> 0")
-        soft = self.labels == "lrent"
-        check_of_use(f"{_KEY}.alpha", self.alpha, 0.25, soft, f"set {_KEY}.labels=lrent")
+    portion: Annotated[float, Interval(gt=0, le=1)] = 0.2
+    step: Annotated[float, Ge(0)] = 0.05
+    most: Annotated[float, Interval(gt=0, le=1)] = 0.5
+    labels: Literal["hard", "lrent"] = "hard"
+    alpha: Annotated[float, Gt(0)] = 0.25
 
     def portion_of(self, round_: int) -> float:
         """min(portion + round step, most), in decimal arithmetic."""
@@ -92,8 +74,7 @@ class Cbst:
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; the figure "confident" counts predictions above theta."""
-        if teacher.probabilities is None:
-            raise ConfigError("CBST needs the probabilities of all classes")
+        assert teacher.probabilities is not None
         classes, portion = teacher.classes, self.portion_of(round_)
         thresholds = class_thresholds(teacher.confidence, teacher.predicted, classes, portion)
         quotient = teacher.probabilities / thresholds  # [n, K]; thresholds > 0, as a largest p is

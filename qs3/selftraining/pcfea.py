@@ -9,31 +9,35 @@ of the warm-up that stands among the selectors, as one of them may choose its po
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any, ClassVar
+import math
+from decimal import Decimal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_choice, check_float, check_of_use
-from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.kernels.norms import begin_target_norms, use_domain
-from qs3.methods.base import Method, check_taught, class_loss
+from qs3.methods.base import Method, Weight, class_loss
 from qs3.methods.sd import move_towards
 from qs3.selftraining.selectors import (
-    Selector,
     TeacherPredictions,
     chosen_by,
     doubts,
     most_confident,
 )
+from qs3.utils.settings import checked
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
+
+
+Share = Annotated[float, Interval(ge=0, lt=1)]
 
 
 class Pcfea(Method):
@@ -78,54 +82,31 @@ class Pcfea(Method):
     part: Tensor
     covariance: Tensor
 
+    @checked
     def __init__(
         self,
-        strength: float = 0.25,
-        align_weight: float = 1.0,
-        shift: str = "growing",
-        plain: float = 0.1,
-        every: float = 0.05,
-        selector: Selector | None = None,
-        theta: float = 0.8,
-        pool: str = "share",
-        rank: str = "label",
-        momentum: float = 0.0,
+        strength: Weight = 0.25,
+        align_weight: Weight = 1.0,
+        shift: Literal["growing", "full", "none"] = "growing",
+        plain: Share = 0.1,
+        every: Annotated[float, Interval(gt=0, le=1)] = 0.05,
+        selector: Any = None,
+        theta: Share = 0.8,
+        pool: Literal["share", "threshold"] = "share",
+        rank: Literal["label", "most"] = "label",
+        momentum: Share = 0.0,
     ) -> None:
         super().__init__()
-        self.strength = check_float("method.strength", strength, ">= 0")
-        self.align_weight = check_float("method.align_weight", align_weight, ">= 0")
-        self.shift = check_choice("method.shift", shift, ("growing", "full", "none"))
-        self.pool = check_choice("method.pool", pool, ("share", "threshold"))
-        self.rank = check_choice("method.rank", rank, ("label", "most"))
-        self.momentum = check_float("method.momentum", momentum, "[0, 1)")
-        self.plain = check_float("method.plain", plain, "[0, 1)")
-        self.every = check_float("method.every", every, "(0, 1]")
-        self.theta = check_float("method.theta", theta, "[0, 1)")
-        if selector is not None and not hasattr(selector, "select"):
-            raise ConfigError("method.selector must be null or a selector, as in selftraining=qbst")
-        if getattr(selector, "needs_features", False):
-            raise ConfigError(
-                "method.selector chooses by features, which pools do not give it; take one such as "
-                "QBST's or SPST's"
-            )
-        chooses = "set method.selector, as method=pcfea_qbst and pcfea_spst do"
-        check_of_use("method.theta", theta, 0.8, selector, chooses)
-        check_of_use("method.rank", rank, "label", pool == "share", "set method.pool=share")
+        self.strength, self.align_weight = strength, align_weight
+        self.shift, self.pool, self.rank, self.momentum = shift, pool, rank, momentum
+        self.plain, self.every, self.theta = plain, every, theta
         self.selector = selector
         self.styled = False  # whether there is a pool
         self.teacher: Any = None  # the running mean, if there is one
 
     def prepare(self, net: Any) -> None:
         """Room for the figures of a pool, which a checkpoint holds."""
-        head = getattr(net, "head", None)
-        if not isinstance(head, nn.Sequential) or not isinstance(head[-1], nn.Linear):
-            raise ConfigError(
-                "method=pcfea needs a class head whose last layer is linear; choose e.g. "
-                "model=dgcnn or model=pointnet"
-            )
-        if self.align_weight and len(head) == 1:  # what it is given is the net's vector
-            check_taught(net, "method.align_weight with a head of one layer")
-        classes, width = head[-1].weight.shape
+        classes, width = net.head[-1].weight.shape
         self.register_buffer("mean", torch.zeros(classes, width))
         self.register_buffer("source_mean", torch.zeros(classes, width))
         self.register_buffer("covariance", torch.zeros(classes, width, width))
@@ -163,11 +144,7 @@ class Pcfea(Method):
         return F.cross_entropy(cosines / 2, labels)
 
     def start_epoch(self, net: nn.Module, data: AdaptationData, epoch: int, epochs: int) -> None:
-        """A new pool, if one is due.
-
-        Raises:
-            ConfigError: none would be due in any epoch.
-        """
+        """Make a new pool, if one is due."""
         first = plain_epochs(self.plain, epochs)
         self.styled = epoch >= first
         between = max(1, round(self.every * epochs))
@@ -178,7 +155,7 @@ class Pcfea(Method):
                 begin_target_norms(one)
         size, classes = data.eval_batch_size, len(self.mean)
         labels, asked = data.labelled.labels.numpy(), self.teacher or net
-        f, p = _features(asked, data.labelled.clouds.all(), size, "source", self.mean.device)
+        f, p = _features(asked, data.labelled.clouds.points, size, "source", self.mean.device)
         g, q = _features(asked, data.target.points, size, "target", self.mean.device)
         said = TeacherPredictions.of(q, data.target.ids)
         named = said.predicted
@@ -206,6 +183,20 @@ class Pcfea(Method):
         self.source_mean.copy_(source_mean)
         self.mean.copy_(mean)
         self.covariance.copy_(covariance)
+
+
+def plain_epochs(plain: float, epochs: int) -> int:
+    """The first epoch with a pool: ceil(plain epochs), in decimal arithmetic.
+
+    So 0.07 of 100 epochs are 7, whose product in binary is just above.
+
+    Raises:
+        ConfigError: there is none among the `epochs`: PCFEA would be source only.
+    """
+    first = math.ceil(Decimal(repr(float(plain))) * epochs)
+    if first >= epochs:
+        raise ConfigError(f"method.plain={plain} of protocol.epochs={epochs} leaves no epoch")
+    return first
 
 
 def penultimate(net: Any, points: Tensor) -> tuple[Float[Tensor, "b d"], Float[Tensor, "b c"]]:

@@ -6,25 +6,24 @@ leaves open is as in its released code. Its first step is `qs3.methods.sd`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Interval
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_bool, check_int, check_of_use, check_ranges
-from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, TeacherPredictions, doubts, most_confident
 from qs3.utils.seeding import derive
+from qs3.utils.settings import settings
 
-_KEY = "selftraining.selector"
 WIDTH = 128  # of the graph net, and the principal components of the features that it sees
 _BLOCK = 1024  # rows of the correlations that are held at once
 
 
-@dataclass(frozen=True)
+@settings
 class GraphRefined:
     """All target clouds; those most confident by a graph net with its labels and full weight.
 
@@ -43,41 +42,25 @@ class GraphRefined:
     Attributes:
         graph: False refines nothing: the teacher's own probabilities decide (a control).
         growth: of the share, each round, in (0, 1]; 0.05 for rounds of 5 epochs of 100.
-        unsure: weight in [0, 1]; 0 needs `selftraining.use_source`, as round 0 has no others.
+        unsure: weight in (0, 1].
         correlation: in [-1, 1).
         neighbours: of a cloud, itself not counted.
         steps: of Adam (1e-3, weight decay 5e-4).
         seed: of the run.
     """
 
-    own_thresholds = True
-
     graph: bool = True
-    growth: float = 0.05
-    unsure: float = 0.2
-    correlation: float = 0.95
-    neighbours: int = 10
-    steps: int = 1000
+    growth: Annotated[float, Interval(gt=0, le=1)] = 0.05
+    unsure: Annotated[float, Interval(gt=0, le=1)] = 0.2
+    correlation: Annotated[float, Interval(ge=-1, lt=1)] = 0.95
+    neighbours: Annotated[int, Ge(1)] = 10
+    steps: Annotated[int, Ge(1)] = 1000
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_bool(f"{_KEY}.graph", self.graph)
-        check_ranges(self, f"{_KEY}.", growth="(0, 1]", unsure="[0, 1]", correlation="[-1, 1)")
-        for key in ("neighbours", "steps"):
-            check_int(f"{_KEY}.{key}", getattr(self, key), 1)
-        for key, usual in (("correlation", 0.95), ("neighbours", 10), ("steps", 1000)):
-            value = getattr(self, key)
-            check_of_use(f"{_KEY}.{key}", value, usual, self.graph, f"set {_KEY}.graph=true")
 
     @property
     def needs_features(self) -> bool:
         """Whether the table must have features."""
         return self.graph
-
-    @property
-    def begins_weightless(self) -> bool:
-        """Whether nothing that round 0 selects weighs anything."""
-        return self.unsure == 0
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; chooses all above theta (0 as a rule), with weights in `soft`."""
@@ -105,12 +88,8 @@ class GraphRefined:
         )
 
     def _scores(self, teacher: TeacherPredictions, round_: int) -> Float[np.ndarray, "n k"]:
-        if teacher.features is None:
-            raise ConfigError(
-                f"{_KEY}.graph=true needs a model's features; choose e.g. model=dgcnn, or set it "
-                "to false"
-            )
         assert teacher.probabilities is not None
+        assert teacher.features is not None
         order = np.argsort(np.asarray(teacher.ids), kind="stable")  # whatever that of the rows
         features = torch.from_numpy(teacher.features[order]).double()
         edges = neighbours_of(features, self.correlation, self.neighbours)

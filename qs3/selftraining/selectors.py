@@ -9,18 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.config.checks import check_choice, check_of_use
-from qs3.datamodules.phases import LOWER_THETA, RAISE_SHARE
 from qs3.errors import ConfigError, SelectionError
-from qs3.utils.plural import counted
 from qs3.utils.seeding import derive
-
-_KEEP_ALL = "set selftraining.selector.mu=one"
+from qs3.utils.settings import settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +103,7 @@ class Selector(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@settings
 class Qbst:
     r"""Quasi-balanced self-training (QS3, section 3.2): the rarer a class, the more of it is kept.
 
@@ -123,20 +119,9 @@ class Qbst:
             can exceed n, so mu_k is clamped at 0 there.
     """
 
-    instead_of_mu: ClassVar[str] = _KEEP_ALL
-
-    mu: str = "balanced"
-    order: str = "descending"
-    counts: str = "confident"
-
-    def __post_init__(self) -> None:
-        check_choice("selftraining.selector.mu", self.mu, ("balanced", "one"))
-        check_choice("selftraining.selector.order", self.order, ("descending", "ascending"))
-        check_choice("selftraining.selector.counts", self.counts, ("confident", "all"))
-        some = self.mu == "balanced"  # else all that are confident are kept
-        for key, usual in (("order", "descending"), ("counts", "confident")):
-            key, value = f"selftraining.selector.{key}", getattr(self, key)
-            check_of_use(key, value, usual, some, "set selftraining.selector.mu=balanced")
+    mu: Literal["balanced", "one"] = "balanced"
+    order: Literal["descending", "ascending"] = "descending"
+    counts: Literal["confident", "all"] = "confident"
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes and how sure of them it is."""
@@ -163,7 +148,7 @@ class Qbst:
         )
 
 
-@dataclass(frozen=True)
+@settings
 class Spst:
     """Self-paced self-training: every sample with p_i > theta (GAST, section 3.3; no other rule).
 
@@ -229,48 +214,15 @@ def chosen_by(
     """What a selector, perhaps a user's, chooses; `kept` counted anew by its mask and its labels.
 
     Raises:
-        ConfigError: it is no `Selection`, or does not say of each sample whether it is kept: places
-            in place of a mask would be taken for other samples. Or a label is none of a class, or
-            a figure not one of each class.
+        ConfigError: `selected` is not a mask: positions would be taken for other samples.
     """
     found = selector.select(teacher, theta, round_)
-    mask, n = getattr(found, "selected", None), len(teacher.ids)
-    if isinstance(found, Selection) and isinstance(mask, np.ndarray):
-        if mask.dtype == np.bool_ and mask.shape == (n,):
-            _check_figures(type(selector).__name__, found, n, teacher.classes)
-            labels = teacher.predicted if found.labels is None else found.labels
-            return replace(found, kept=np.bincount(labels[mask], minlength=teacher.classes))
-        what = f"{mask.dtype} {list(mask.shape)}"
-    else:
-        what = f"of type {type(found if mask is None else mask).__name__}"
-    raise ConfigError(
-        f"{type(selector).__name__}.select must return a Selection (qs3.selftraining.selectors) "
-        f"whose `selected` is an array of True or False for each of {counted(n, 'sample')}; it is "
-        f"{what}"
-    )
-
-
-def _check_figures(name: str, found: Selection, n: int, classes: int) -> None:
-    """Refuse labels that are no classes, and figures of another shape or kind than is recorded."""
-    for key, shape, kinds in (
-        ("mu", (classes,), "iuf"),
-        ("confident", (classes,), "iu"),
-        ("labels", (n,), "iu"),
-        ("soft", (n, classes), "f"),
-        ("thresholds", (classes,), "iuf"),
-    ):
-        value = getattr(found, key)
-        if value is None and key not in ("mu", "confident"):
-            continue
-        value = np.asarray(value)
-        if value.shape != shape or value.dtype.kind not in kinds:
-            of = "numbers" if "f" in kinds else "whole numbers"
-            raise ConfigError(
-                f"{name}.select: `{key}` must be an array {list(shape)} of {of}, it is "
-                f"{value.dtype} {list(value.shape)}"
-            )
-        if key == "labels" and not ((value >= 0) & (value < classes)).all():
-            raise ConfigError(f"{name}.select: `labels` must lie in 0 to {classes - 1}")
+    if found.selected.dtype != np.bool_ or found.selected.shape != (len(teacher.ids),):
+        name = type(selector).__name__
+        raise ConfigError(f"{name}.select: `selected` must be True or False for each sample")
+    labels = teacher.predicted if found.labels is None else found.labels
+    kept = np.bincount(labels[found.selected], minlength=teacher.classes)
+    return replace(found, kept=kept)
 
 
 def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
@@ -279,38 +231,11 @@ def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
     return replace(selection, selected=np.ones(len(labels), dtype=bool), kept=kept)
 
 
-def check_teacher(teacher: TeacherPredictions, round_: int, trainable: bool = True) -> None:
-    """Refuse a teacher whose probabilities are not numbers, before a selector is asked.
-
-    Args:
-        teacher: the predictions that round `round_` would choose from.
-        round_: for the message; in round 0 the warm-up's net made them, later the round before's.
-        trainable: whether the warm-up's net was trained in this run.
-
-    Raises:
-        SelectionError: a probability is NaN: the net has diverged.
-    """
-    lost = int(np.isnan(teacher.confidence).sum())
-    if not lost:
-        return
-    net = f"round {round_ - 1}'s student" if round_ else "the warm-up's net"
-    way = "lower protocol.optimizer.lr"
-    if not round_ and not trainable:
-        net, way = "the net of weights=", "choose another one"
-    raise SelectionError(
-        f"{net} has diverged: its probabilities of {lost} of {len(teacher.ids)} target clouds are "
-        f"not numbers, so that round {round_} has no pseudo-labels; {way}"
-    )
-
-
 def check_selection(
     selection: Selection,
     class_names: Sequence[str],
     round_: int,
     missing_class: str,
-    more: Sequence[str] = (LOWER_THETA,),
-    longer: str | None = "protocol.epochs",
-    instead_of_mu: str | None = _KEEP_ALL,
     processes: int = 1,
 ) -> list[str]:
     """Names of the classes without a pseudo-label, after checking that training is possible.
@@ -320,11 +245,6 @@ def check_selection(
         class_names: in label order.
         round_: for messages.
         missing_class: "warn" or "error".
-        more: what would select more, for messages; see `SelfTrainingConfig.more_labels`. Of a
-            threshold that all samples exceed nothing is said.
-        longer: the setting by which the teacher is trained for longer; None: it was given.
-        instead_of_mu: what selects more where only one class is confident; None where the selector
-            has no mu for it; see `SelfTrainingConfig.instead_of_mu`.
         processes: that share the samples out, one of them to two where they come out uneven.
 
     Raises:
@@ -333,35 +253,10 @@ def check_selection(
     """
     missing = [name for name, n in zip(class_names, selection.kept, strict=True) if n == 0]
     total = int(selection.kept.sum())
-    table = ", ".join(
-        f"{name} {kept}/{confident}"
-        for name, kept, confident in zip(
-            class_names, selection.kept, selection.confident, strict=True
-        )
-    )
-    facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
-    better = [] if longer is None else [f"train the teacher longer ({longer})"]
-    # Where all are above the threshold, a lower one selects no more.
-    every = int(selection.confident.sum()) >= len(selection.selected)
-    ways = [way for way in more if not (every and way in (LOWER_THETA, RAISE_SHARE))] + better
-    if total <= processes:
-        own_mu = selection.mu[selection.confident > 0]
-        why = ""
-        if instead_of_mu and len(own_mu) == 1 and own_mu[0] == 0:
-            why = "all confident samples are of one class, so its mu is 0; "
-            ways.append(instead_of_mu)
-        if processes > 1:
-            why += f"each of {processes} processes needs two; "
-            ways.append("give fewer trainer.devices")
+    if total <= processes or (missing and missing_class == "error"):
+        lack = "" if total <= processes else f", none for {', '.join(missing)}"
         raise SelectionError(
-            f"only {counted(total, 'pseudo-label')} selected in {facts}; {why}{', or '.join(ways)}"
-        )
-    if missing and missing_class == "error":
-        why = ""
-        if every and not selection.confident[selection.kept == 0].any():
-            why, ways = "the teacher takes no cloud for one; ", better
-        ways = [*ways, "accept it with selftraining.missing_class=warn"]
-        raise SelectionError(
-            f"no pseudo-label for {', '.join(missing)} in {facts}; {why}{', or '.join(ways)}"
+            f"round {round_}: {total} pseudo-labels above theta={selection.theta:g}{lack}; lower "
+            "the threshold, or train the teacher for longer"
         )
     return missing

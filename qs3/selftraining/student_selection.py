@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,13 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor, nn
 
 from qs3.datamodules.adaptation import AdaptationData
-from qs3.datamodules.phases import LOWER_THETA, Phases
+from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
 from qs3.runs.checkpoints import copy_weights, save
-from qs3.utils.plural import counted
 from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
@@ -89,9 +88,6 @@ class StudentSelection(Callback):
         folder: of the run.
         phases: of the run.
         rule: one of `selection_rules.STUDENT_RULES`.
-        classes: names in label order.
-        more: what would select more pseudo-labels, for messages; see
-            `SelfTrainingConfig.more_labels`.
 
     Attributes:
         scores: by epoch, of those of the last round so far; none with `last`.
@@ -99,17 +95,8 @@ class StudentSelection(Callback):
         held_out: positions in the target's training clouds [h], and their pseudo-labels [h].
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        phases: Phases,
-        rule: str,
-        classes: Sequence[str],
-        more: Sequence[str] = (LOWER_THETA,),
-    ) -> None:
+    def __init__(self, folder: Path, phases: Phases, rule: str) -> None:
         self.folder, self.phases, self.rule = folder, phases, rule
-        self._ways = ", or ".join([*more, f"set selection.student={LAST}"])
-        self.classes = tuple(classes)
         self.scores: dict[int, float] = {}
         self.epoch: int | None = None
         self.score: float | None = None
@@ -148,14 +135,14 @@ class StudentSelection(Callback):
             self._weights = copy_weights(classifier.net)
 
     def _score(self, net: nn.Module, data: AdaptationData, classifier: Classifier) -> float:
-        clouds = data.target.clouds
+        clouds = data.target
         if self.rule != PSEUDO_VAL:
-            table = predict(net, clouds.all(), data.eval_batch_size, classifier.device)
+            table = predict(net, clouds.points, data.eval_batch_size, classifier.device)
             return LABEL_FREE[self.rule].score(table)
         assert self.held_out is not None
         index, labels = self.held_out
         table = predict(
-            net, clouds.at(index.numpy()).all(), data.eval_batch_size, classifier.device
+            net, clouds.at(index.numpy()).points, data.eval_batch_size, classifier.device
         )
         return float((table.argmax(axis=1) == labels.numpy()).mean())
 
@@ -175,18 +162,10 @@ class StudentSelection(Callback):
         held[named.numpy()] = hold_out(
             hard[named].numpy(), ids, derive(data.seed, PSEUDO_VAL, round_)
         )
-        if not held.any():
-            counts = np.bincount(hard[named].numpy(), minlength=len(self.classes))
-            found = ", ".join(f"{n} {c}" for n, c in zip(self.classes, counts, strict=True))
+        if not held.any() or int((~held).sum()) <= processes:
             raise SelectionError(
-                f"round {round_}: selection.student={PSEUDO_VAL} holds out a fifth of each class's "
-                f"pseudo-labels, but no class has three ({found}); {self._ways}"
-            )
-        if (left := int((~held).sum())) <= processes:
-            raise SelectionError(
-                f"round {round_}: selection.student={PSEUDO_VAL} leaves "
-                f"{counted(left, 'pseudo-label')} to train on, and each of {processes} processes "
-                f"needs two; give fewer trainer.devices, or {self._ways}"
+                f"round {round_}: too few pseudo-labels for selection.student={PSEUDO_VAL}, which "
+                f"holds out a fifth of each class's; set selection.student={LAST}"
             )
         mask = torch.from_numpy(held)
         self.held_out = (index[mask], hard[mask])

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.datamodules.splits import Labelled
+from qs3.datamodules.clouds import Labelled
 from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy
 from qs3.evaluation.metrics import adapt_norms, predict, predict_rotated
 from qs3.evaluation.prior import Prior
@@ -42,7 +42,7 @@ ADAPTERS: dict[str, Callable[..., None]] = {
     "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/tried.md
     "tent": minimise_entropy,
 }
-"""Values of `evaluation.norms` (`qs3.training.settings.NORMS`), beside "trained"."""
+"""Values of `evaluation.norms` (`qs3.training.run.Judging`), beside "trained"."""
 
 
 @dataclass(frozen=True, eq=False)

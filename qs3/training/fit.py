@@ -11,7 +11,6 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
@@ -31,7 +30,6 @@ from qs3.training.provenance import warn_of_changes
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
-from qs3.utils.plural import counted
 from qs3.utils.processor_time import Moment, processor_seconds
 from qs3.utils.threads import cores, number_of
 
@@ -54,28 +52,14 @@ def fit(run: Run) -> RunMetrics:
     loaded = load_data(run, method, given)
     if not run.cfg.force:
         loaded = replace(loaded, started=take_checkpoint(run, loaded.started))
-    if run.cfg.trainer.threads == "auto":
-        _take_threads_of(loaded.started)
-    warn_of_changes(loaded.started, run.cfg)
+    if trainer.threads == "auto":  # sums are ordered by the threads that the run was begun with
+        torch.set_num_threads(loaded.started["threads"])
+        log.info("trainer.threads=auto: %d of %d cores", torch.get_num_threads(), len(cores()))
+    warn_of_changes(loaded.started)
     built = build_training(run, method, loaded, given, began)
-    _remember(run, loaded, built)
     _fit(run, loaded, built)
     outcome = evaluate(run, loaded, built)
     return write_outcome(run, loaded, built, outcome)
-
-
-def _take_threads_of(started: dict[str, Any]) -> None:
-    """Go on with as many threads as the run was begun with: sums are ordered by them."""
-    if isinstance(begun := started.get("threads"), int) and begun > 0:
-        torch.set_num_threads(begun)
-    log.info("trainer.threads=auto: %d of %d cores", torch.get_num_threads(), len(cores()))
-
-
-def _remember(run: Run, loaded: Loaded, built: Built) -> None:
-    """Features of all clouds, for a net that is frozen; nothing for others."""
-    data, kept = loaded.data, run.cfg.data.cache_dir
-    clouds = (data.all_labelled, data.target.clouds, loaded.evaluation.test.clouds)
-    remember(built.classifier.net, clouds, Path(kept) if kept else None)
 
 
 def _fit(run: Run, loaded: Loaded, built: Built) -> None:
@@ -88,15 +72,13 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
         ConfigError: Lightning cannot do as `trainer` says with these data, or a callback has ended
             the training.
     """
+    data, kept = loaded.data, run.cfg.data.cache_dir
+    clouds = (data.all_labelled, data.target, loaded.evaluation.test)
+    remember(built.classifier.net, clouds, Path(kept) if kept else None)
     if not run.cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
         built.shared_warmup.take()
     last = run.folder / LAST
-    epochs = counted(run.phases.total, "epoch")
-    if run.cfg.selection.teacher == "given" and not run.scheme.rounds:
-        what = "no rounds: the classifier of weights= is judged as it is, not after its"
-        log.info("%s %s of warm-up", what, epochs)
-    else:
-        log.info("%s, %s", "fitting, continued" if last.is_file() else "fitting", epochs)
+    log.info("fitting%s, %d epochs", ", continued" * last.is_file(), run.phases.total)
     try:
         built.trainer.fit(
             built.classifier,
@@ -109,10 +91,7 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     except SIGTERMException as error:  # of a worker of a sweep; by itself it would be status 0
         raise SystemExit(128 + signal.SIGTERM) from error
     if (done := built.trainer.current_epoch) < run.phases.total:  # `trainer.should_stop`
-        raise ConfigError(
-            f"training ended after {done} of {epochs}, as a callback asked for: a run is its "
-            "warm-up and its rounds; leave that callback out"
-        )
+        raise ConfigError(f"training ended after {done} of {run.phases.total} epochs")
     if built.trainer.is_global_zero:
         save(copy_weights(built.classifier.net), run.folder / STUDENT)
     built.trainer.strategy.barrier("student saved")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError
 from qs3.inference.model_file import read_result
 from qs3.inference.predictor import learnt_of
 
@@ -36,14 +36,6 @@ class Given:
     sha256: str
     learnt: Float[np.ndarray, " c"] | None = None
 
-    def check_classes(self, classes: Sequence[str]) -> None:
-        """Raise DataError if the run's are others."""
-        if self.classes != tuple(classes):
-            raise DataError(
-                f"weights={self.name} tells {', '.join(self.classes)} apart, and these data have "
-                f"the classes {', '.join(classes)}, in this order"
-            )
-
 
 def read_given(cfg: DictConfig) -> Given | None:
     """What `weights` names; None where it names nothing.
@@ -57,21 +49,11 @@ def read_given(cfg: DictConfig) -> Given | None:
     result = read_result(cfg.weights)
     name = Path(cfg.weights).name
     model: Any = OmegaConf.to_container(cfg.model, resolve=True)
-    moved = {"file"} if "sha256" in model else set()  # what is in it counts, not where it lies
-    keys = sorted({*model, *result.model} - moved)
-    if odd := [key for key in keys if model.get(key) != result.model.get(key)]:
-        was, wanted = result.model.get(odd[0]), model.get(odd[0])
-        raise ConfigError(
-            f"weights={name}: its net has {odd[0]}={was}, the config says {wanted}; set "
-            f"model.{odd[0]}={was}, or choose its model"
-            if odd[0] != "_target_"
-            else f"weights={name} is a {was}, model= chooses {wanted}"
-        )
+    for key in sorted({*model, *result.model} - ({"file"} if "sha256" in model else set())):
+        if (was := result.model.get(key)) != model.get(key):
+            raise ConfigError(f"weights={name} has model.{key}={was}, not {model.get(key)}")
     if result.scale != cfg.data.scale:
-        raise ConfigError(
-            f"weights={name}: its clouds have data.scale={result.scale}, the config says "
-            f"{cfg.data.scale}"
-        )
+        raise ConfigError(f"weights={name} has data.scale={result.scale}, not {cfg.data.scale}")
     weights = {
         key: value.float() if value.is_floating_point() else value
         for key, value in result.weights.items()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +10,10 @@ import numpy as np
 
 from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
-from qs3.datamodules.splits import labels_of, load_clouds, subsample_splits
+from qs3.datamodules.clouds import labels_of, load_clouds
+from qs3.datamodules.splits import subsample_splits
 from qs3.datasets.domain import Domain
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.evaluation.metrics import Evaluation
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf
@@ -71,37 +71,34 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         seed=run.seed,
         owner=method.labels,
         uses_target=method.uses_target,
-        wants=method.wants,
+        again=method.again,
     )
     data.prepare_data()
     source, target = run.source.open(verify=False), run.target.open(verify=False)
-    _check_classes(source, target, cfg.num_classes)
-    if given:
-        given.check_classes(target.classes)
-    used = source if data.owner == "source" else target
-    started = note_start(run, used, target, given, data.labelled_domain.beside_sha256)
+    for classes in (source.classes, *([given.classes] if given else [])):
+        if classes != target.classes or len(classes) != cfg.num_classes:
+            raise DataError(
+                f"the classes {', '.join(classes)} and those of {target.name}, "
+                f"{', '.join(target.classes)}, must be the same num_classes={cfg.num_classes}"
+            )
+    started = note_start(run, source if data.owner == "source" else target, target, given)
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
-    _warn_of_untrained(data, target.classes)
-    _check_norms(run, len(data.target.ids))
-    _check_rounds(run, len(data.target.ids))
+    _warn_of_untrained(data, target)
     learnt = drawn = class_shares.of_labelled(data, len(target.classes))
-    if given and run.cfg.selection.teacher == "given" and given.learnt is not None:
+    if given and cfg.selection.teacher == "given" and given.learnt is not None:
         learnt = given.learnt
-    # What is no prior ends a run before it trains.
+    # What is not a prior ends a run before it trains.
     class_shares.prior_of(cfg.evaluation, target.classes, learnt, lambda: learnt[None])
     if (few := cfg.data.clouds_a_split) is not None:
         target = subsample_splits(target, few)
-    split = _evaluated_split(target)
+    split = "test" if "test" in target.counts() else "train"  # somebody's own scans have no other
+    if split == "train" or labels_of(target, split) is None:
+        log.warning("%s has no labels for a test: only predictions are counted", target.name)
+    cache, scale = data.target_domain.cache_dir, cfg.data.scale
     evaluation = Evaluation(
-        load_clouds(
-            target,
-            split,
-            cfg.data.points,
-            cache_dir=data.target_domain.cache_dir,
-            scale=cfg.data.scale,
-        ),
+        load_clouds(target, split, cfg.data.points, cache_dir=cache, scale=scale),
         labels_of(target, split) if split == "test" else None,
         _labels_by_id(target, "train"),
         target.classes,
@@ -115,70 +112,12 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt)
 
 
-def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:
-    if source.classes != target.classes:
-        raise DataError(
-            f"{source.name} has the classes {source.classes}, {target.name} {target.classes}; "
-            "they must be the same, in the same order"
-        )
-    if len(source.classes) != num_classes:
-        raise ConfigError(
-            f"num_classes is {num_classes}, but {source.name} has {len(source.classes)} classes; "
-            f"set num_classes={len(source.classes)}"
-        )
-
-
-def _warn_of_untrained(data: AdaptationData, classes: Sequence[str]) -> None:
+def _warn_of_untrained(data: AdaptationData, target: PointSet) -> None:
     """Of classes that no cloud teaches: a net cannot name them."""
-    train, held_out = (
-        np.bincount(part.labels.numpy(), minlength=len(classes))
-        for part in (data.labelled, data.validation)
-    )
-    for no_clouds, why in (
-        ((train == 0) & (held_out == 0), "it has none"),
-        (
-            (train == 0) & (held_out > 0),
-            f"data.val={data.labelled_domain.val} holds out all that it has; set "
-            "data.val=stratified, which leaves each class one",
-        ),
-    ):
-        if no_clouds.any():
-            names = ", ".join(np.array(classes)[no_clouds])
-            name = data.labelled_domain.domain.name
-            log.warning("%s: nothing is trained of %s: %s", name, names, why)
-
-
-def _check_norms(run: Run, clouds: int) -> None:
-    """Refuse statistics of one target cloud: where a cloud is one vector, that has no variance."""
-    norms = run.cfg.evaluation.norms
-    if norms != "trained" and clouds < 2:
-        raise DataError(
-            f"evaluation.norms={norms} takes the statistics of batch norms from the target's "
-            f"training clouds, of which {run.target.name} has {clouds}, and two are needed; set "
-            "evaluation.norms=trained, or give it more clouds"
-        )
-
-
-def _check_rounds(run: Run, clouds: int) -> None:
-    """Refuse rounds on one target cloud before the warm-up: a student's batch needs two."""
-    if run.scheme.rounds and clouds < 2:
-        raise DataError(
-            f"self-training learns from the target's training clouds, of which {run.target.name} "
-            f"has {clouds}, and two are needed; set selftraining=none, or give it more clouds"
-        )
-
-
-def _evaluated_split(target: PointSet) -> str:
-    """The test split; the training split if there is no other, e.g. of somebody's own scans."""
-    if "test" in target.counts():
-        if labels_of(target, "test") is None:
-            log.warning("%s has no labels: no accuracy, only counts of predictions", target.name)
-        return "test"
-    log.warning(
-        "%s has no test split: no accuracy, only counts of predictions for its training clouds",
-        target.name,
-    )
-    return "train"
+    counts = np.bincount(data.labelled.labels.numpy(), minlength=len(target.classes))
+    if not counts.all():
+        names = ", ".join(np.array(target.classes)[counts == 0])
+        log.warning("no labelled cloud for training: %s", names)
 
 
 def _labels_by_id(dataset: PointSet, split: str) -> dict[str, int] | None:

@@ -1,4 +1,4 @@
-"""What a run notes when it starts, and compares when it goes on."""
+"""What a run notes when it starts, and compares when it goes on: data, versions, code, threads."""
 
 from __future__ import annotations
 
@@ -12,15 +12,13 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
-from omegaconf import DictConfig
 
 from qs3.config import hashing
-from qs3.datamodules.fps_cache import remove_old_leftovers
-from qs3.errors import ConfigError
+from qs3.datamodules.fps_samples import remove_old_leftovers
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
 from qs3.store.store import PointSet
-from qs3.training.code import changed_files, code_sha256, files_sha256
+from qs3.training.code import changed_files, files_sha256
 from qs3.training.given import Given
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
@@ -28,36 +26,25 @@ from qs3.utils.version import VERSION, commit
 
 log = logging.getLogger(__name__)
 
+WEIGHTS = "the classifier that weights= names"
+
 
 def note_start(
-    run: Run,
-    source: PointSet,
-    target: PointSet,
-    given: Given | None = None,
-    beside_sha256: str = "",
+    run: Run, source: PointSet, target: PointSet, given: Given | None = None
 ) -> dict[str, Any]:
-    """Read `started.json` and compare it with today's data, or write it; `force` begins anew.
-
-    `beside_sha256`: of twins and views that are trained on; "" where there are none.
-    """
+    """Read `started.json` and compare it with today's data, or write it; `force` begins anew."""
     weights = {"weights": f"{given.name} {given.sha256}"} if given else {}
     now: dict[str, Any] = {
         "data": {"source": source.sha256, "target": target.sha256},
-        **({"beside": beside_sha256} if beside_sha256 else {}),
         "versions": versions() | weights,
         "commit": commit(),
-        "code": code_sha256(run.cfg),
         "files": files_sha256(run.cfg),
         "threads": torch.get_num_threads(),
         "config_sha256": hashing.config_sha256(run.cfg),
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:
         first = runs.read_started(run.folder) or {}
-        if first.get("config_sha256") != now["config_sha256"]:
-            raise ConfigError(
-                "the processes of this run have different settings (was a file of conf/ changed "
-                "while they started?); start it again"
-            )
+        assert first.get("config_sha256") == now["config_sha256"], "conf/ changed during the start"
         return {**now, "threads": first.get("threads")}
     if run.cfg.force:  # not before: without its data an old result would be lost for nothing
         runs.clear(run.folder)
@@ -66,22 +53,24 @@ def note_start(
     if run.cfg.data.cache_dir:
         remove_old_leftovers(Path(run.cfg.data.cache_dir))
     started = runs.read_begun(run.folder)
-    if started is None:
-        runs.write_started(run.folder, now)
-        return now
-    runs.check_config(run.folder, started.get("config_sha256"), now["config_sha256"])
-    for role, dataset in (("source", source), ("target", target)):
-        runs.check_data(run.folder, dataset.name, started["data"][role], dataset.sha256)
-    beside = started.get("beside", "")
-    runs.check_data(run.folder, runs.beside(source.name), beside, beside_sha256)
-    runs.check_data(run.folder, WEIGHTS, given_sha256(started), given_sha256(now))
-    if not (run.folder / LAST).is_file():  # nothing of it is left to go on with
-        runs.write_started(run.folder, now)
-        return now
-    return started
+    if started is not None:
+        compare(run.folder, started, now)
+        if (run.folder / LAST).is_file():
+            return started
+    runs.write_started(run.folder, now)
+    return now
 
 
-WEIGHTS = "the classifier that weights= names"
+def compare(folder: Path, started: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse to continue the run in a folder with other settings, data or another classifier.
+
+    Raises:
+        ConfigError, DataError: something differs.
+    """
+    runs.check_config(folder, started.get("config_sha256"), now["config_sha256"])
+    for role in ("source", "target"):
+        runs.check_data(folder, f"data.{role}", started["data"][role], now["data"][role])
+    runs.check_data(folder, WEIGHTS, given_sha256(started), given_sha256(now))
 
 
 def given_sha256(started: Mapping[str, Any]) -> str:
@@ -90,7 +79,7 @@ def given_sha256(started: Mapping[str, Any]) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of what decides a result beside settings and data."""
+    """Of what decides a result besides settings and data."""
     return {
         "qs3": VERSION,
         "python": platform.python_version(),
@@ -100,35 +89,22 @@ def versions() -> dict[str, str]:
     }
 
 
-def is_as_begun(started: Mapping[str, Any], cfg: DictConfig) -> bool:
-    """Whether code, versions and torch's threads, which order sums, are those of the start.
-
-    As far as a warm-up goes, in which no selector has a part.
-    """
-    return not {*_changed(started, cfg)} - {*started.get("files", {})}
-
-
-def warn_of_changes(started: Mapping[str, Any], cfg: DictConfig) -> None:
-    """Say if a run goes on with other code, versions or threads than it was begun with."""
-    if changed := _changed(started, cfg):
-        log.warning(
-            "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
-            ", ".join(f"{name} {was}" for name, (was, _) in changed.items()),
-            ", ".join(f"{name} {now}" for name, (_, now) in changed.items()),
-        )
-
-
-def _changed(started: Mapping[str, Any], cfg: DictConfig) -> dict[str, tuple[Any, Any]]:
-    """What is another than at the start, by name: what it was, what it is."""
+def changed(started: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """What differs from the start by name, as it was and as it is: code, versions, threads."""
     now: dict[str, Any] = versions() | {"threads": torch.get_num_threads()}
     begun = {name: value for name, value in started["versions"].items() if name != "weights"}
-    begun["threads"] = started.get("threads") or now["threads"]  # older runs do not say
-    now["code"] = code_sha256(cfg)[:12]
-    begun["code"] = str(started.get("code", now["code"]))[:12]  # nor this
-    if begun["code"] == now["code"]:  # else it has been said
-        files = started.get("files", {})
-        edited = changed_files(files)
-        now |= {name: sha256[:12] for name, sha256 in edited.items()}
-        begun |= {name: files[name][:12] for name in edited}
+    begun["threads"] = started.get("threads")
+    for name, sha256 in changed_files(started["files"]).items():
+        begun[name], now[name] = started["files"][name][:12], sha256[:12]
     names = [name for name in {**begun, **now} if begun.get(name) != now.get(name)]
-    return {name: (begun.get(name, "none"), now.get(name, "none")) for name in names}
+    return {name: (begun.get(name), now.get(name)) for name in names}
+
+
+def warn_of_changes(started: Mapping[str, Any]) -> None:
+    """Warn if a run goes on with other code, versions or threads than it was begun with."""
+    if found := changed(started):
+        log.warning(
+            "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
+            ", ".join(f"{name} {was}" for name, (was, _) in found.items()),
+            ", ".join(f"{name} {now}" for name, (_, now) in found.items()),
+        )

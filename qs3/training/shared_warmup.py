@@ -48,10 +48,7 @@ def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
     for key in _AFTERWARDS:
         OmegaConf.update(before, key, None)
     parts = [hashing.config_sha256(before), started["data"], started["versions"]]
-    parts.append(started.get("threads"))  # sums are ordered by them
-    parts.append(started.get("code"))
-    if "beside" in started:
-        parts.append(started["beside"])
+    parts += [started["threads"], started["files"]]  # sums are ordered by threads
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

@@ -11,8 +11,8 @@ from lightning.pytorch import Trainer
 
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
+from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
-from qs3.datamodules.splits import Unlabelled
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError
 from tests.datamodules.test_domain import made
@@ -33,7 +33,7 @@ def adaptation(data_dir: Path, **settings: Any) -> AdaptationData:
 
 
 def test_metres_are_asked_for_of_domains_that_have_them(data_dir):
-    with pytest.raises(ConfigError, match="domain specklenet10 are not in metres"):
+    with pytest.raises(ConfigError, match="unit"):
         adaptation(data_dir, scale="metres")
 
 
@@ -81,12 +81,12 @@ def test_the_adaptation_has_the_source_s_labels_and_no_test_clouds(data_dir):
     for ours, theirs in ((data.labelled, source.train), (data.validation, source.validation)):
         assert ours.ids == theirs.ids
         assert torch.equal(ours.labels, theirs.labels)
-    assert torch.equal(data.all_labelled.all(), source.whole.points)
+    assert torch.equal(data.all_labelled.points, source.whole.points)
     assert data.labelled_domain.test is data.target_domain.test is None
-    assert isinstance(data.target_domain.whole, Unlabelled)
+    assert isinstance(data.target_domain.whole, Clouds)
     bound = adaptation(data_dir, owner="target_train")
     assert bound.labelled_domain.domain.name == "kinectsim10"
-    assert isinstance(bound.target_domain.train, Unlabelled)
+    assert isinstance(bound.target_domain.train, Clouds)
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")  # Lightning's on trainers without a loader
@@ -100,7 +100,7 @@ def test_a_part_of_the_validation_clouds_is_of_all_classes(data_dir, limit):
         batches = [batch["source"] for batch in data.val_dataloader()]
         given.append(torch.cat([batch["y_source"] for batch in batches]))
         points = torch.cat([batch["points"] for batch in batches])
-        order = [data.validation.clouds.all().tolist().index(cloud) for cloud in points.tolist()]
+        order = [data.validation.clouds.points.tolist().index(cloud) for cloud in points.tolist()]
         assert data.validation.labels[order].tolist() == given[-1].tolist()
         assert sorted(order) == list(range(len(data.validation.ids)))
     assert given[0].equal(data.validation.labels)

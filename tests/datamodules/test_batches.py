@@ -8,28 +8,31 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.datamodules.batches import Batches, Piece, Table, balanced
-from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.batches import Batches, Piece, balanced
+from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.utils.seeding import derive
 
 SAMPLES = 3
 
 
-def table(n: int, balance: str | None = None, starts: int = 1) -> Table:
-    """n clouds of the points 0 and i + 1; with several samples, sample s is the point s alone."""
+def part(n: int, balanced: bool = False, starts: int = 1) -> Labelled:
+    """n clouds of the points 0 and i + 1, whose label is i; or 0 of the first alone, if balanced.
+
+    With several samples, sample s is the point s alone.
+    """
     stored = np.zeros((n, SAMPLES, 3), dtype=np.float32)
     stored[:, :, 0] = np.arange(SAMPLES)
     order = None if starts == 1 else np.tile(np.arange(starts)[:, None], (n, 1, 1))
-    labels = {"y": torch.arange(n), "class": torch.arange(n).clamp(max=1)}
-    return Table(Clouds.of(stored, order), labels, balance)
+    labels = torch.arange(n).clamp(max=1) if balanced else torch.arange(n)
+    return Labelled(Clouds.of(stored, order), labels, "y", balanced)
 
 
 def seen(batches: Batches, name: str = "a") -> list[int]:
     return [int(y) for batch in batches for y in batch[name]["y"]]
 
 
-def batches(n: int, size: int = 4, balance: str | None = None, **kw) -> Batches:
-    return Batches({"a": table(n, balance)}, size, **{"seed": 0, "epoch": 0, **kw})
+def batches(n: int, size: int = 4, balanced: bool = False, **kw) -> Batches:
+    return Batches({"a": part(n, balanced)}, size, **{"seed": 0, "epoch": 0, **kw})
 
 
 @given(st.integers(2, 50), st.integers(2, 9))
@@ -62,7 +65,7 @@ def one_by_one(name: str, n: int, rank: int, world: int):
 def test_order_against_one_drawn_cloud_by_cloud(n, other, world, size):
     for rank in range(world):
         both = Batches(
-            {"a": table(n), "b": table(other)}, size, seed=0, epoch=5, rank=rank, world=world
+            {"a": part(n), "b": part(other)}, size, seed=0, epoch=5, rank=rank, world=world
         )
         for name, count in (("a", n), ("b", other)):
             expected = one_by_one(name, count, rank, world)
@@ -77,7 +80,7 @@ def test_processes_share_the_clouds_equally(n):
 
 
 def test_the_first_table_decides_the_length():
-    both = Batches({"a": table(10), "b": table(3)}, 4, seed=0, epoch=0)
+    both = Batches({"a": part(10), "b": part(3)}, 4, seed=0, epoch=0)
     assert [len(batch["b"]["y"]) for batch in both] == [4, 4, 2]
     assert sorted(seen(both, "b")[:3]) == [0, 1, 2]
 
@@ -87,7 +90,7 @@ def test_the_first_table_decides_the_length():
 
 def samples(seed: int = 0, epoch: int = 0, **kw) -> dict[int, int]:
     """Which sample of each cloud an epoch takes, by the point that the sample consists of."""
-    drawn = Batches({"a": table(60, starts=3)}, 8, seed=seed, epoch=epoch, **kw)
+    drawn = Batches({"a": part(60, starts=3)}, 8, seed=seed, epoch=epoch, **kw)
     radius = 1.0  # of the points 0, 1, 2 about 1
     return {
         int(y): round(float(point[0, 0]) * radius + 1)
@@ -119,12 +122,12 @@ def test_the_sample_does_not_depend_on_the_number_of_processes():
 
 
 def test_all_classes_are_equally_likely_and_the_epoch_stays_as_long():
-    drawn = seen(batches(4000, balance="class"))
+    drawn = seen(batches(4000, balanced=True))
     assert len(drawn) == 4000
     first_class = drawn.count(0)  # one cloud of 4,000
     assert first_class == pytest.approx(2000, abs=160)  # 5 sigma
-    assert seen(batches(4000, balance="class")) == drawn
-    assert seen(batches(4000, balance="class", epoch=1)) != drawn
+    assert seen(batches(4000, balanced=True)) == drawn
+    assert seen(batches(4000, balanced=True, epoch=1)) != drawn
 
 
 def test_no_cloud_twice_before_all_of_its_class():
@@ -142,9 +145,12 @@ def test_a_class_that_does_not_occur_is_not_drawn():
 
 
 def test_processes_get_different_clouds_of_a_balanced_epoch():
-    parts = [set(seen(batches(400, balance="class", rank=r, world=2))) for r in range(2)]
-    assert len(parts[0]) > 60
-    assert parts[0] & parts[1] <= {0}  # the only cloud of its class
+    drawn = []
+    for rank in range(2):
+        one = batches(400, balanced=True, rank=rank, world=2)
+        drawn.append({*one._order("a", one.parts["a"]).tolist()})
+    assert len(drawn[0]) > 60
+    assert drawn[0] & drawn[1] <= {0}  # the only cloud of its class
 
 
 @given(
@@ -158,9 +164,9 @@ def test_pieces_of_a_way_put_together_are_the_way(n, other, size, cuts, world):
     """However it is cut into epochs: the same batches of each process, and none is short."""
 
     def epoch(piece, number, rank=0):
-        tables = {"a": table(n), "b": table(other)}
+        parts = {"a": part(n), "b": part(other)}
         more = {"rank": rank, "world": world, "piece": piece}
-        return Batches(tables, size, seed=0, epoch=number, **more)
+        return Batches(parts, size, seed=0, epoch=number, **more)
 
     ends = list(itertools.accumulate(cuts))
     for rank in range(world):
@@ -187,3 +193,24 @@ def test_on_a_way_every_cloud_comes_before_any_comes_again(n, size):
 def test_two_phases_take_different_ways():
     first, second = (seen(batches(20, piece=Piece(way, 0, 5))) for way in (0, 5))
     assert first != second
+
+
+def test_a_second_draw_is_another_sample_of_the_same_cloud():
+    rng = np.random.default_rng(0)
+    stored = rng.normal(size=(30, 8, 3)).astype(np.float32)
+    order = np.tile(np.arange(8).reshape(4, 2), (30, 1, 1))
+    clouds = Clouds.of(stored, order)
+    drawn = Labelled(clouds, torch.arange(30), "y", again=True)
+    plain = Labelled(clouds, torch.arange(30), "y")
+    same = 0
+    for one, two in zip(
+        *(Batches({"a": part}, 5, seed=0, epoch=1) for part in (drawn, plain)), strict=True
+    ):
+        assert set(two["a"]) == {"points", "y"}
+        assert torch.equal(one["a"]["points"], two["a"]["points"])  # the first draw is as ever
+        for y, points, again in zip(*(one["a"][k] for k in ("y", "points", "again")), strict=True):
+            samples = clouds.at(np.array([int(y)]))
+            samples = [samples.take(torch.tensor([0]), torch.tensor([s]))[0] for s in range(4)]
+            assert any(torch.equal(again, some) for some in samples)
+            same += torch.equal(points, again)
+    assert 1 <= same <= 16  # of 30, a quarter by chance

@@ -34,7 +34,7 @@ def test_batch_equals_the_normalised_clouds_to_the_bit(mapped):
 def test_without_choice_the_whole_cloud_in_its_order():
     clouds = Clouds.of(STORED)
     assert clouds.starts == 1
-    assert np.array_equal(clouds.all().numpy(), unit_ball(STORED))
+    assert np.array_equal(clouds.points.numpy(), unit_ball(STORED))
 
 
 def test_in_metres_clouds_are_centred_and_keep_their_size():
@@ -42,14 +42,14 @@ def test_in_metres_clouds_are_centred_and_keep_their_size():
     stored = np.stack([corners, 2 * corners]) + np.float32(8)
     about = np.array([[-2, -1, 0], [2, -1, 0], [-2, 1, 0], [2, 1, 0]], dtype=np.float32)
     clouds = Clouds.of(stored, scale="metres")
-    assert np.array_equal(clouds.all().numpy(), [about, 2 * about])
+    assert np.array_equal(clouds.points.numpy(), [about, 2 * about])
     np.testing.assert_allclose(clouds.radius, [5**0.5, 20**0.5], rtol=1e-6)
     order = np.array([[[3, 0]], [[1, 2]]], dtype=np.int16)
     some = Clouds.of(stored, order, "metres").at(np.array([1])).take(torch.tensor([0]))
     assert np.array_equal(some.numpy(), 2 * about[None, [1, 2]])
     ball = clouds.in_unit_ball()
     assert ball.stored is clouds.stored
-    assert np.array_equal(ball.all().numpy(), unit_ball(stored))
+    assert np.array_equal(ball.points.numpy(), unit_ball(stored))
 
 
 def test_above_the_floor_clouds_keep_their_height_and_no_other_place():
@@ -57,10 +57,10 @@ def test_above_the_floor_clouds_keep_their_height_and_no_other_place():
     stored = np.stack([corners, 2 * corners]) + np.float32([8, 8, -0.75])
     clouds = Clouds.of(stored, scale="above_floor", floor=-1.25)
     about = np.array([[-2, -1, 0.5], [2, -1, 0.5], [-2, 1, 1.5], [2, 1, 1.5]])
-    assert np.array_equal(clouds.all()[0].numpy(), about)
-    assert clouds.all()[1, :, 2].tolist() == [0.5, 0.5, 2.5, 2.5]
+    assert np.array_equal(clouds.points[0].numpy(), about)
+    assert clouds.points[1, :, 2].tolist() == [0.5, 0.5, 2.5, 2.5]
     order = np.array([[[3, 0]], [[1, 2]]], dtype=np.int16)
-    some = Clouds.of(stored, order, "above_floor", -1.25).at(np.array([0])).all()
+    some = Clouds.of(stored, order, "above_floor", -1.25).at(np.array([0])).points
     assert np.array_equal(some[0].numpy(), about[[3, 0]])
 
 
@@ -76,14 +76,14 @@ def test_a_part_shares_the_clouds(mapped):
     part = mapped.at(np.array([4, 2]))
     assert len(part) == 2
     assert part.stored is mapped.stored
-    assert torch.equal(part.all(), mapped.all()[[4, 2]])
+    assert torch.equal(part.points, mapped.points[[4, 2]])
     again = part.at(np.array([False, True]))
-    assert torch.equal(again.all(), mapped.all()[[2]])
+    assert torch.equal(again.points, mapped.points[[2]])
 
 
 def test_a_cloud_of_one_repeated_point_becomes_zeros():
     clouds = Clouds.of(np.full((1, 9, 3), 5.3, dtype=np.float32))
-    assert not clouds.all().any()
+    assert not clouds.points.any()
 
 
 def test_nothing_of_a_map_is_copied(mapped):

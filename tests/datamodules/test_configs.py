@@ -26,7 +26,7 @@ MODULES = {
 def test_each_file_is_tried_here_and_names_every_setting():
     assert choices("datamodule") == sorted(MODULES)
     takes = inspect.signature(DomainData).parameters
-    left_out = {"clouds_a_split", "clouds_a_class", "asks"}  # of debugging, and of a message
+    left_out = {"clouds_a_split", "clouds_a_class"}  # of debugging
     for name in MODULES:
         plain = OmegaConf.to_container(composed(None, f"+datamodule={name}").datamodule)
         assert set(plain) == {"_target_", *takes} - left_out

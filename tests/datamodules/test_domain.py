@@ -12,10 +12,10 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
 from qs3.datamodules.augment import Augment
+from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
-from qs3.datamodules.splits import Labelled, Unlabelled, load_clouds
 from qs3.datasets.domain import compose_domain
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, MissingDataError
 from qs3.geometry.sampling import unit_ball
 from qs3.store.store import PointSet, open_pointset
 from tests.training.search import Truth, search
@@ -56,11 +56,6 @@ class Mine(LightningModule):
         return torch.optim.Adam(self.parameters(), 0.02)
 
 
-@pytest.fixture
-def trainer(tmp_path: Path) -> Trainer:
-    return trainer_of(tmp_path)
-
-
 def trainer_of(folder: Path, epochs: int = 2) -> Trainer:
     return Trainer(
         max_epochs=epochs, accelerator="cpu", logger=False, default_root_dir=folder,
@@ -94,7 +89,8 @@ def labels_of(batches: Any) -> list[int]:
 # --- with a trainer ----------------------------------------------------------------------------
 
 
-def test_five_lines_train_test_and_predict(data_dir, trainer):
+def test_five_lines_train_test_and_predict(data_dir, tmp_path):
+    trainer = trainer_of(tmp_path)
     data = SpeckleNetData(points=32, batch_size=8, data_dir=data_dir)
     module = Mine()
     trainer.fit(module, data)
@@ -176,13 +172,6 @@ def test_clouds_are_augmented_while_training_and_then_alone(data_dir, tmp_path):
         assert torch.equal(a, b)
 
 
-def test_a_module_that_only_predicts_takes_a_domain_without_labels(data_dir, trainer):
-    data = DomainData("kinectsim10", points=32, labels=False, data_dir=data_dir)
-    predicted = torch.cat(trainer.predict(Mine(), data))
-    assert len(predicted) == 24
-    assert data.train is None  # it was not asked for
-
-
 # --- what the loaders give ---------------------------------------------------------------------
 
 
@@ -222,10 +211,8 @@ def test_heights_are_taken_from_the_domain_s_floor(data_dir):
     found = batch["points"].double().numpy()
     np.testing.assert_allclose(found[..., 2], stored[..., 2] + 0.5, atol=1e-5)
     np.testing.assert_allclose(found[..., :2].mean(axis=1), 0, atol=1e-5)
-    with pytest.raises(ConfigError, match=r"kinectsim10 \(its key `floor_m`\)"):
+    with pytest.raises(ConfigError, match="floor_m"):
         DomainData("kinectsim10", scale="above_floor", data_dir=data_dir)
-    with pytest.raises(ConfigError, match="kinectsim10: nobody knows where the floor is"):
-        load_clouds(open_pointset(data_dir / "kinectsim10"), "test", 64, scale="above_floor")
 
 
 def test_training_clouds_are_divided_once(data_dir):
@@ -244,7 +231,7 @@ def test_training_clouds_are_divided_once(data_dir):
 def test_a_stage_loads_what_it_needs(data_dir, stage, ready):
     data = SpeckleNetData(points=32, data_dir=data_dir)
     for name in ("train", "test", "predict"):
-        with pytest.raises(DataError, match=r"specklenet10: .* not loaded; call setup\(\)"):
+        with pytest.raises(AssertionError, match="setup"):
             getattr(data, f"{name}_dataloader")()
     data.setup(stage)
     held = (data.whole, data.train, data.validation, data.test)
@@ -257,22 +244,14 @@ def test_a_stage_loads_what_it_needs(data_dir, stage, ready):
     assert (data.test is None) == ("test" not in ready)
 
 
-def test_a_domain_without_a_test_split_says_so(tmp_path, trainer):
-    write_domain(tmp_path, "specklenet10", noise=0.05, test=0)
-    data = SpeckleNetData(points=32, data_dir=tmp_path)
-    trainer.fit(Mine(), data)
-    with pytest.raises(DataError, match=r"domain specklenet10: .* its dataset has no such split"):
-        trainer.test(Mine(), data)
-
-
 def test_without_labels_there_are_none_anywhere(tmp_path):
     """Classes in a random order, so that a search can tell; it finds them where they are asked."""
     write_shuffled_target(tmp_path, class_in_id=False)
     truth = truth_of(tmp_path)
     hidden = made(tmp_path, domain="kinectsim10", labels=False)
-    assert isinstance(hidden.train, Unlabelled)
+    assert isinstance(hidden.train, Clouds)
     assert hidden.train is hidden.whole
-    assert isinstance(hidden.test, Unlabelled)
+    assert isinstance(hidden.test, Clouds)
     assert hidden.validation is None
     assert hidden.val_dataloader() == []
     batches = [*hidden.train_dataloader(), *hidden.test_dataloader()]
@@ -342,48 +321,5 @@ def test_each_has_its_domain_and_says_what_is_missing(kind, name, tmp_path):
     data = kind(data_dir=tmp_path)
     assert data.domain.name == name
     assert data.domain.folder == tmp_path / name
-    with pytest.raises(MissingDataError, match=rf"{name}(.|\n)*meta\.yaml"):
+    with pytest.raises(MissingDataError, match=name):
         data.prepare_data()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"domain": "nowhere10"}, "domain=nowhere10 is unknown; there are .*specklenet10"),
-        ({"val": "other"}, "val must be one of .*lineage.*'other'"),
-        ({"sampler": "other"}, "sampler must be one of .*balanced.*'other'"),
-        ({"points": 65}, "points is 65"),
-        ({"scale": "feet"}, "scale must be one of .*metres.*'feet'"),
-        ({"scale": "metres"}, "domain specklenet10 are not in metres"),
-        ({"points": 0}, "data.points must be a whole number >= 1, got 0"),
-        ({"points": "32"}, "data.points must be .* got '32'"),
-        ({"fps_starts": 0}, "data.fps_starts must be a whole number >= 1, got 0"),
-        ({"fps_starts": -1}, "data.fps_starts"),
-        ({"batch_size": 0}, "data.batch_size must be a whole number >= 2, got 0"),
-        ({"batch_size": 1}, "data.batch_size must be a whole number >= 2, got 1"),
-        ({"batch_size": -4}, "data.batch_size"),
-        ({"batch_size": 2.5}, "data.batch_size"),
-        ({"eval_batch_size": 0}, "data.eval_batch_size must be a whole number >= 1, got 0"),
-        ({"clouds_a_split": 0}, "data.clouds_a_split must be a whole number >= 1, got 0"),
-        ({"clouds_a_class": 0}, "data.clouds_a_class must be a whole number >= 1, got 0"),
-        ({"clouds_a_class": -2}, "data.clouds_a_class"),
-        ({"seed": 0.5}, "data.seed must be a whole number >= 0, got 0.5"),
-        ({"labels": "false"}, "data.labels must be true or false, got 'false'"),
-        (
-            {"labels": False, "sampler": "balanced"},
-            "sampler=balanced goes by classes, but .*labels",
-        ),
-        ({"labels": False, "clouds_a_class": 5}, "clouds_a_class=5 goes by classes, but .*labels"),
-    ],
-)
-def test_wrong_settings_are_errors_for_people(data_dir, settings, message):
-    with pytest.raises(ConfigError, match=message):
-        made(data_dir, **settings)
-
-
-def test_numbers_of_numpy_are_numbers(data_dir):
-    data = made(data_dir, points=np.int64(32), batch_size=np.int32(8), clouds_a_class=np.int8(9))
-    assert torch.equal(
-        clouds_of(data.train_dataloader()),
-        clouds_of(made(data_dir, clouds_a_class=9).train_dataloader()),
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,8 +11,7 @@ import torch
 from qs3.config import hashing
 from qs3.engine import checkpointing
 from qs3.engine.checkpointing import AtomicCheckpointIO, Clock
-from qs3.errors import DataError
-from qs3.runs.checkpoints import load, save
+from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from qs3.utils.files import sha256_file
 from qs3.utils.processor_time import Moment
@@ -28,14 +28,6 @@ def wind_forward(checkpoint):
     content["callbacks"]["Clock"]["seconds"] += LONG
     content["callbacks"]["Clock"]["core_seconds"] += LONG
     torch.save(content, checkpoint)
-
-
-@pytest.mark.parametrize("odd", [{"weight": torch.zeros(2)}, [1]])
-def test_a_file_that_is_no_checkpoint_is_refused(tmp_path, odd):
-    """Such as weights that were copied over it: Lightning would miss a key of its own."""
-    save(odd, tmp_path / "last.ckpt")
-    with pytest.raises(DataError, match=r"last\.ckpt holds something else.*force=true"):
-        AtomicCheckpointIO().load_checkpoint(tmp_path / "last.ckpt")
 
 
 def test_earlier_starts_count(toy):  # noqa: F811
@@ -65,11 +57,11 @@ def test_a_shared_warmup_counts(toy, tmp_path):  # noqa: F811
 @pytest.fixture
 def meters(monkeypatch):
     """The clock's time, and what process and GPU have had at most, as a test sets them."""
-    found = {"time": 100.0, "cores": 20.0, "memory": None, "gpu": None}
+    found = {"time": 100.0, "cores": 20.0, "memory": 0, "gpu": None}
     monkeypatch.setattr(checkpointing, "processor_seconds", lambda: found["cores"])
     monkeypatch.setattr(checkpointing.time, "time", lambda: found["time"])
-    monkeypatch.setattr(checkpointing, "peak_bytes", lambda: found["memory"])
-    monkeypatch.setattr(checkpointing, "forget_peak", lambda: None)
+    usage = lambda _: SimpleNamespace(ru_maxrss=found["memory"] / 1024)  # noqa: E731
+    monkeypatch.setattr(checkpointing.resource, "getrusage", usage)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: found["gpu"] is not None)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: found["gpu"])
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda: None)
@@ -107,17 +99,8 @@ def test_a_clock_goes_on_with_the_greater_peak_and_both_times(meters):
         **{"seconds": 51.0, "core_seconds": 72.0},
         "peaks": {"memory": 3 * GB, "gpu": GB},
     }
-    meters |= {"memory": None, "gpu": None}
+    meters |= {"memory": 0, "gpu": None}
     assert clock.state_dict()["peaks"] == {"memory": 3 * GB, "gpu": GB // 2}
-
-
-def test_what_an_older_start_did_not_count_is_not_known(meters):
-    """Not the time since then alone, which would look like a short run."""
-    clock = Clock(Moment(wall=100.0, cores=20.0))
-    clock.load_state_dict({"seconds": 50.0, "peaks": {"memory": 0, "gpu": 0}})
-    meters["cores"] = 22.0
-    assert clock.taken().core_seconds is None
-    assert clock.state_dict()["core_seconds"] is None
 
 
 def test_a_checkpoint_goes_where_it_is_asked_for(tmp_path):

@@ -9,7 +9,6 @@ from torch import nn
 
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.splits import Unlabelled
 from qs3.evaluation.calibration import calibration_error, reliability
 from qs3.evaluation.metrics import (
     Evaluation,
@@ -125,11 +124,9 @@ def test_mean_over_turns():
 @pytest.mark.parametrize("labelled", [True, False])
 @pytest.mark.parametrize("tiers", [{"a": "clean", "b": "hard", "d": "clean"}, {}, None])
 def test_each_tier_is_scored_by_itself(labelled, tiers):
-    clouds = Clouds.of(np.zeros((4, 6, 3), np.float32))
+    clouds = Clouds.of(np.zeros((4, 6, 3), np.float32), names=tuple("abcd"))
     labels = torch.tensor([0, 1, 0, 1]) if labelled else None
-    evaluation = Evaluation(
-        Unlabelled(clouds, tuple("abcd")), labels, None, ("x", "y"), tiers=tiers
-    )
+    evaluation = Evaluation(clouds, labels, None, ("x", "y"), tiers=tiers)
     p = np.array([[0.9, 0.1], [0.8, 0.2], [0.4, 0.6], [0.3, 0.7]], np.float32)
     of_each = evaluation.predictions_of(p).tiers
     assert of_each == (("clean", "hard", "", "clean") if tiers else ())
@@ -146,10 +143,11 @@ def test_each_tier_is_scored_by_itself(labelled, tiers):
 @pytest.mark.parametrize("rotations", [0, 3])
 @pytest.mark.parametrize("labelled", [True, False])
 def test_turned_scores_stand_beside_the_plain_ones(rotations, labelled):
-    clouds = Clouds.of(np.random.default_rng(0).normal(size=(5, 6, 3)).astype(np.float32))
+    stored = np.random.default_rng(0).normal(size=(5, 6, 3)).astype(np.float32)
+    clouds = Clouds.of(stored, names=tuple("abcde"))
     labels = torch.tensor([0, 1, 0, 1, 1]) if labelled else None
-    evaluation = Evaluation(Unlabelled(clouds, tuple("abcde")), labels, None, ("x", "y"), rotations)
-    first, of_turn = predict(Net(), clouds.all(), 2), turned(clouds.all(), 2)
+    evaluation = Evaluation(clouds, labels, None, ("x", "y"), rotations)
+    first, of_turn = predict(Net(), clouds.points, 2), turned(clouds.points, 2)
     plain, mean = evaluation.scores_of(first), evaluation.rotation_averaged(of_turn)
     assert (mean is None) == (rotations == 0)
     assert (plain.accuracy is None) == (not labelled)

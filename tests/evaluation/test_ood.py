@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.fps_cache import prepare
+from qs3.datamodules.clouds import Clouds, prepare
 from qs3.evaluation.ood import (
     MEASURES,
     limits,
@@ -98,7 +97,7 @@ def test_the_tails_are_a_thousandth():
     ends = limits(clouds)
     stored = np.asarray(clouds.stored)
     out = [
-        ood_reasons(measure(c, s.numpy()), ends) for c, s in zip(stored, clouds.all(), strict=True)
+        ood_reasons(measure(c, s.numpy()), ends) for c, s in zip(stored, clouds.points, strict=True)
     ]
     # the extremes alone lie beyond 0.1 % and 99.9 % of 400: two a measure, `points` has no spread
     assert 1 <= sum(bool(each) for each in out) <= 8
@@ -141,7 +140,7 @@ def test_what_is_strange_is_named():
     normal = rng.normal(size=(128, 3)).astype(np.float32)
 
     def reasons(cloud: np.ndarray) -> str:
-        ready = prepare(cloud[None].astype(np.float32), 64).all()[0].numpy()
+        ready = prepare(cloud[None].astype(np.float32), 64).points[0].numpy()
         return "; ".join(ood_reasons(measure(cloud, ready), ends))
 
     assert reasons(normal) == ""

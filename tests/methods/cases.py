@@ -93,7 +93,7 @@ def batch_of(
         batch["source"] = {"points": points[0], f"y_{method.labels}": labels}
     if method.uses_target or case.pseudo:
         batch["target"] = {"points": points[1]}
-    if method.wants.again:
+    if method.again:
         batch["source"]["again"] = clouds(1)[0]
     if case.pseudo:
         soft = nn.functional.one_hot(labels, classes).float() * 0.7 + 0.3 / classes

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch.nn import functional as F
 
-from qs3.datamodules.twins import Wants
 from qs3.methods.twin import Twin
 from tests.methods.parted import blobs
 from tests.methods.shapes import CLASSES, accuracy, tiny_net, train
@@ -13,7 +12,7 @@ from tests.methods.shapes import CLASSES, accuracy, tiny_net, train
 
 def test_both_draws_teach_the_class() -> None:
     net, method, points = tiny_net(norm=False), Twin(again_weight=13.0), torch.rand(2, 4, 24, 3)
-    assert method.wants == Wants(again=True)
+    assert method.again
     assert not method.uses_target
     labels = torch.arange(4)
     batch = {"source": {"points": points[0], "again": points[1], "y_source": labels}}

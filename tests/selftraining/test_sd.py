@@ -12,7 +12,6 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import ConfigError
 from qs3.selftraining.sd import GraphNet, GraphRefined, neighbours_of, principal
 from qs3.selftraining.selectors import TeacherPredictions
 
@@ -124,9 +123,7 @@ def test_the_order_of_the_rows_and_torch_s_generator_do_not_matter() -> None:
     assert not np.array_equal(other.soft, here.soft)
 
 
-def test_without_features_it_says_what_to_do() -> None:
-    teacher = TeacherPredictions.of(np.full((4, 2), 0.5), list("abcd"))
-    with pytest.raises(ConfigError, match="needs a model's features"):
-        GraphRefined().select(teacher, 0.0, 1)
-    with pytest.raises(ConfigError, match=r"selector\.growth must be in \(0, 1\]"):
-        GraphRefined(growth=0.0)
+@pytest.mark.parametrize("wrong", [{"growth": 0.0}, {"unsure": 0.0}, {"correlation": 1.0}])
+def test_settings_out_of_their_range_are_refused(wrong) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        GraphRefined(**wrong)

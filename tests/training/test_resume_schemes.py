@@ -15,7 +15,7 @@ from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
-from tests.training.toy import CONF, TWIN
+from tests.training.toy import CONF
 from tests.training.watching import interrupt
 
 # 7 epochs: 0-2 warm-up, 3-4 round 0, 5-6 round 1
@@ -45,7 +45,7 @@ METHODS = {
     "pointdan": ("method=pointdan", NODES),
     "sd": ("method=sd", FEATURED),
     "cpcm": ("method=cpcm",),
-    "twin": (*TWIN, "data.source.views=random", FEATURED),
+    "twin": ("method=twin",),
     "mlsp": ("method=mlsp", FEATURED),
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
     "pcfea_qbst": ("method=pcfea_qbst", FEATURED),

@@ -235,6 +235,7 @@ def test_the_hash_covers_what_comes_before():
         "experiment_name": "a",
     }
     started = {"data": {"source": {"sha256": "a"}, "target": 1}, "versions": {"a": 1, "b": 2}}
+    started |= {"threads": 1, "files": {}}
 
     def of(key="", value=None, started=started):
         cfg = OmegaConf.create(plain)
@@ -251,7 +252,7 @@ def test_the_hash_covers_what_comes_before():
     ):
         assert of(key, value) == of(), key
     turned = {"versions": {"b": 2, "a": 1}, "data": {"target": 1, "source": {"sha256": "a"}}}
-    assert of(started=turned) == of()
+    assert of(started={**started, **turned}) == of()
     others = [
         of("model.k", 10),
         of("selection.teacher", "best"),
@@ -272,7 +273,7 @@ def test_what_comes_from_later_settings_counts_by_its_value(key, before):
         cfg = OmegaConf.create({**plain, "data": {"evaluation": 1}})
         for place in (key, "selection.teacher"):
             OmegaConf.update(cfg, place, values.get(place, 1))
-        return warmup_sha256(cfg, {"data": 1, "versions": 2})
+        return warmup_sha256(cfg, {"data": 1, "versions": 2, "threads": 1, "files": {}})
 
     assert of("x") == of("x", **{key: 2})
     written = f"{before}{key}}}"

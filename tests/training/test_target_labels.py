@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.datamodules.validation_split import RULES
+from qs3.datamodules.splits import RULES
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import Evaluation
 from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.store.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.training.command import train
 from tests.training.search import Truth, search
-from tests.training.toy import _SHAPES, CLASSES, TWIN, write_domain
+from tests.training.toy import _SHAPES, CLASSES, write_domain
 
 TRAIN, TEST = 90, 45
 
@@ -114,7 +114,7 @@ CASES = [
     (("selftraining=none",), True),
     (("selftraining.use_source=true",), True),
     *(((f"selection.student={rule}",), False) for rule in STUDENT_RULES),
-    ((*TWIN, "selftraining=none", "model._target_=tests.training.nets.featured"), False),
+    (("method=twin", "selftraining=none"), False),
 ]
 SLOW = ("twin", "last", "entropy", "infomax")  # rules; like the others
 

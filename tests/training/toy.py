@@ -25,7 +25,6 @@ MADE_OF = {
     ),
 }
 CONF = Path(__file__).parents[2] / "conf"
-TWIN = ("method=twin",)
 
 
 class TinyNet(nn.Module):
@@ -52,25 +51,21 @@ def write_domain(
     test: int = 8,
     points: int = 64,
 ) -> None:
-    """A store of `train` and `test` clouds a class, or each class; their twins lack the noise."""
+    """A store of `train` and `test` clouds a class, or of each class."""
     rng = np.random.default_rng(len(name))
-    clouds, exact, rows = [], [], []
+    clouds, rows = [], []
     for split, count in (("train", train), ("test", test)):
         each = count if isinstance(count, tuple) else (count,) * len(CLASSES)
         for cls, n in zip(CLASSES, each, strict=True):
             for i in range(n):
                 cloud = rng.normal(size=(points, 3)) * _SHAPES[cls]
-                exact.append(cloud)
                 clouds.append(cloud + noise * rng.normal(size=(points, 3)))
                 rows.append(ManifestRow(id=f"{cls}/{split}/{i:03d}", cls=cls, split=split))
     write_pointset(
         folder / name,
         name=name,
         classes=CLASSES,
-        arrays={
-            "points": np.array(clouds, dtype=np.float32),
-            **{f"points_{twin}": np.array(exact, dtype=np.float32) for twin in ("exact", "whole")},
-        },
+        arrays={"points": np.array(clouds, dtype=np.float32)},
         rows=rows,
         meta=MADE_OF.get(name, MadeOf()).meta,
     )

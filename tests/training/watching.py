@@ -40,7 +40,7 @@ class Watch(Callback):
         data = trainer.datamodule
         for domain, clouds in (("source", data.labelled.clouds), ("target", data.target.clouds)):
             if domain in batch:
-                same = (batch[domain]["points"][:, None] == clouds.all()[None]).all(dim=(2, 3))
+                same = (batch[domain]["points"][:, None] == clouds.points[None]).all(dim=(2, 3))
                 assert (same.sum(1) == 1).all()
                 self.seen[domain] += same.int().argmax(1).tolist()
 

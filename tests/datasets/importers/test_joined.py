@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.datamodules.validation_split import lineage
+from qs3.datamodules.splits import lineage
 from qs3.datasets.domain import Domain, compose_domain
 from qs3.datasets.importers.joined import Joined
 from qs3.errors import ConfigError, DataError, MissingDataError
