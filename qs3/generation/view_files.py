@@ -27,7 +27,7 @@ from qs3.errors import DataError, Qs3Error
 from qs3.generation.provenance import photograph
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.sensors.base import DepthFrame
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from qs3.utils.files import remove_leftovers, write_bytes
 
 _MAPS = ("depth_m", "clean_m", "label", "cosine", "reason")  # of a DepthFrame

@@ -22,7 +22,7 @@ from qs3.generation.provenance import (
 from qs3.generation.view_files import load_views, save_view, view_folder
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.sensors.base import DepthFrame
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from qs3.store.store import ManifestRow, open_pointset, open_table, read_meta, write_pointset
 from tests.generation.generating import config, fingerprint
 

@@ -19,11 +19,9 @@ from qs3.sensors.matching import (
     StereoBlockMatcher,
 )
 from qs3.sensors.matching.filters import FillHoles, Median, NeighbourCheck, Quantiser, SmallRegions
-from qs3.sensors.optics.blender_filmic import FilmicCamera
 from qs3.sensors.optics.fringe_code import FringeCode
-from qs3.sensors.optics.infrared import InfraredCamera
-from qs3.sensors.optics.patterns import Speckle
-from qs3.sensors.optics.released_slide import ReleasedSlide
+from qs3.sensors.optics.infrared import FilmicCamera, InfraredCamera
+from qs3.sensors.optics.patterns import ReleasedSlide, Speckle
 from qs3.sensors.renderers.base import Projector, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer

@@ -27,8 +27,8 @@ from qs3.geometry.cameras import Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import Quantiser
+from qs3.sensors.optics.misalignment import smooth_field
 from qs3.sensors.optics.patterns import Speckle
-from qs3.sensors.optics.smooth_field import smooth_field
 from qs3.sensors.optics.visibility import explained, white_lamp
 
 

@@ -17,7 +17,7 @@ from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics
 from qs3.sensors.base import DepthFrame, DepthSensor, Shot, check_depths
-from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.sensors.optics.visibility import Reason, first_reason
 from qs3.utils.plural import counted
 
 

@@ -26,8 +26,7 @@ from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
 from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.infrared import InfraredCamera
-from qs3.sensors.optics.subpixel_offsets import sample_centres
-from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.sensors.optics.visibility import Reason, first_reason, sample_centres
 from qs3.sensors.renderers.base import Image, Projector, tangents
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from qs3.config.checks import check_ranges
 from qs3.sensors.base import DepthFrame, DepthSensor, Shot
-from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.sensors.optics.visibility import Reason, first_reason
 from qs3.sensors.renderers.base import tangents
 
 

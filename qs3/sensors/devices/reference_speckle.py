@@ -17,8 +17,7 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Matcher, ReferenceMatcher
-from qs3.sensors.matching.base import found_px
-from qs3.sensors.matching.texture import for_picture
+from qs3.sensors.matching.base import for_picture, found_px
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Slide, Speckle
 from qs3.sensors.renderers.base import Projector

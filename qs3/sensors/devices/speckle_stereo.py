@@ -22,13 +22,11 @@ from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
 from qs3.sensors.matching import Match, Matcher, StereoBlockMatcher
-from qs3.sensors.matching.base import found_px
-from qs3.sensors.matching.texture import for_picture
-from qs3.sensors.optics.blender_filmic import FilmicCamera
-from qs3.sensors.optics.infrared import InfraredCamera
+from qs3.sensors.matching.base import for_picture, found_px
+from qs3.sensors.optics.infrared import FilmicCamera, InfraredCamera
 from qs3.sensors.optics.misalignment import Misalignment
 from qs3.sensors.optics.patterns import Slide, Speckle
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from qs3.sensors.renderers.base import Image, Projector
 
 

@@ -39,8 +39,7 @@ from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, DepthSensor, Shot, check_depths
-from qs3.sensors.optics.visibility import white_lamp
-from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.sensors.optics.visibility import Reason, first_reason, white_lamp
 from qs3.sensors.renderers.base import Image, Scene
 
 SPEED_OF_LIGHT = 299_792_458.0

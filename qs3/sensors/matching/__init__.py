@@ -1,10 +1,9 @@
 """From images to disparity: matchers that any sensor can use."""
 
 from qs3.sensors.matching.base import Match, Matcher
-from qs3.sensors.matching.block import STEREOBM_BIAS_PX, StereoBlockMatcher
 from qs3.sensors.matching.census import CensusMatcher
 from qs3.sensors.matching.correlation import NormalisedCorrelation, ReferenceMatcher
-from qs3.sensors.matching.sgbm import SemiGlobalMatcher
+from qs3.sensors.matching.opencv import STEREOBM_BIAS_PX, SemiGlobalMatcher, StereoBlockMatcher
 
 __all__ = [
     "STEREOBM_BIAS_PX",

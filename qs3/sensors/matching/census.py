@@ -1,4 +1,4 @@
-"""Matching by the order of grey values: census strings and semi-global aggregation."""
+"""Census strings and how many of their bits differ."""
 
 from __future__ import annotations
 
@@ -10,12 +10,165 @@ from numpy.lib.stride_tricks import as_strided, sliding_window_view
 
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
-from qs3.sensors.matching.base import Match, columns_of
-from qs3.sensors.matching.hamming import census, count_ones
-from qs3.sensors.matching.semiglobal import aggregate
-from qs3.sensors.matching.subpixel import Fit, linearised, offset
-from qs3.sensors.matching.texture import TextureOverNoise, window_moments
-from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.sensors.matching.base import (
+    Fit,
+    Match,
+    TextureOverNoise,
+    columns_of,
+    linearised,
+    offset,
+    window_moments,
+)
+from qs3.sensors.optics.visibility import Reason, first_reason
+
+
+def census(image: np.ndarray, window_px: int) -> list[np.ndarray]:
+    """Which pixels of the window around a pixel are brighter than it.
+
+    Zabih and Woodfill, Non-parametric local transforms, ECCV 1994, section 3. The border is
+    mirrored.
+
+    Args:
+        image: [h, w] uint8 or float32.
+        window_px: side of the window, odd.
+
+    Returns:
+        Arrays [h, w] of unsigned integers, as few and as narrow as hold window_px ** 2 - 1 bits.
+    """
+    half = window_px // 2
+    height, width = image.shape
+    padded = cv2.copyMakeBorder(image, half, half, half, half, cv2.BORDER_REFLECT_101)
+    around = [divmod(k, window_px) for k in range(window_px**2)]
+    around.remove((half, half))
+    planes = np.zeros((-(-len(around) // 8), height, width), dtype=np.uint8)
+    for bit, (dy, dx) in enumerate(around):
+        brighter = padded[dy : dy + height, dx : dx + width] > image
+        planes[bit // 8] |= brighter.view(np.uint8) << np.uint8(bit % 8)
+    words = []
+    while len(planes):
+        size = min(8, 1 << (len(planes) - 1).bit_length())
+        word = np.zeros((height, width, size), dtype=np.uint8)
+        part = planes[:size]
+        word[..., : len(part)] = part.transpose(1, 2, 0)
+        words.append(word.view(f"u{size}")[..., 0])
+        planes = planes[size:]
+    return words
+
+
+def count_ones(words: np.ndarray) -> np.ndarray:
+    """Number of set bits of unsigned integers, as uint8.
+
+    Neighbouring bits are added, then pairs, then fours, then all bytes by one multiplication
+    (Warren, Hacker's Delight, section 5-1): no table, and vectorised.
+    """
+    kind = words.dtype.type
+    bits = 8 * words.dtype.itemsize
+    full = (1 << bits) - 1
+    every_second, pairs, fours = (kind(full // d) for d in (3, 5, 17))
+    x = words - ((words >> kind(1)) & every_second)
+    y = (x >> kind(2)) & pairs
+    x &= pairs
+    x += y
+    np.right_shift(x, kind(4), out=y)
+    x += y
+    x &= fours
+    if bits > 8:
+        x *= kind(full // 255)
+        x >>= kind(bits - 8)
+    return x.astype(np.uint8)
+
+
+STRIP_ROWS = 64
+"""Rows that are turned at a time for the horizontal paths: some MB, which a cache holds."""
+
+
+def aggregate(
+    cost: np.ndarray,
+    small: int,
+    large: int,
+    paths: int,
+    guide: np.ndarray | None = None,
+    edge_grey: float = 0.0,
+) -> np.ndarray:
+    """Sum of the path costs.
+
+    Args:
+        cost: [h, w, D] uint16; paths * (largest cost + large) must be below 65536.
+        small: P1, for a step of one disparity between neighbours.
+        large: P2, for any larger step.
+        paths: 4 (along rows and columns) or 8 (and diagonals).
+        guide: [h, w] grey values; with `edge_grey` g > 0, P2 between two pixels that differ by
+            a grey values is P2 / (1 + a / g), and at least P1.
+        edge_grey: see `guide`; 0 switches it off.
+
+    Returns:
+        [h, w, D] uint16.
+    """
+    total = np.zeros_like(cost)
+    grey = None if guide is None or edge_grey <= 0 else guide.astype(np.float32)
+    sideways = (-1, 0, 1) if paths == 8 else (0,)
+    for shift in sideways:
+        for flip in (slice(None), slice(None, None, -1)):
+            picture = None if grey is None else grey[flip]
+            _sweep(cost[flip], total[flip], small, large, shift, picture, edge_grey)
+    for top in range(0, len(cost), STRIP_ROWS):
+        rows = slice(top, top + STRIP_ROWS)
+        turned = np.ascontiguousarray(cost[rows].transpose(1, 0, 2))
+        total_turned = np.zeros_like(turned)
+        for flip in (slice(None), slice(None, None, -1)):
+            picture = None if grey is None else grey[rows].T[flip]
+            _sweep(turned[flip], total_turned[flip], small, large, 0, picture, edge_grey)
+        total[rows] += total_turned.transpose(1, 0, 2)
+    return total
+
+
+def _sweep(
+    cost: np.ndarray,
+    total: np.ndarray,
+    small: int,
+    large: int,
+    shift: int,
+    grey: np.ndarray | None,
+    edge_grey: float,
+) -> None:
+    """Add to `total` the costs of paths that step from line i - 1, place m - shift to i, m.
+
+    Args:
+        cost, total: [lines, places, D] uint16.
+        grey: [lines, places] float32 or None.
+    """
+    lines, places, _ = cost.shape
+    p1, p2 = np.uint16(small), np.uint16(large)
+    # Kept with its minimum at 0, so that min L_p drops out; zero, as before the first line, at
+    # both ends, where diagonals enter.
+    kept = np.zeros((places + 2, cost.shape[2]), dtype=np.uint16)
+    before = kept[1 - shift : 1 - shift + places]
+    here = kept[1:-1]
+    best = np.empty_like(here)
+    step = np.empty_like(here)
+    steps = None if grey is None else _modulated(grey, small, large, shift, edge_grey)
+    for i in range(lines):
+        np.minimum(before, p2 if steps is None else steps[i], out=best)
+        np.add(before, p1, out=step)
+        np.minimum(best[:, 1:], step[:, :-1], out=best[:, 1:])
+        np.minimum(best[:, :-1], step[:, 1:], out=best[:, :-1])
+        best += cost[i]
+        total[i] += best
+        np.subtract(best, best.min(axis=1, keepdims=True), out=here)
+
+
+def _modulated(
+    grey: np.ndarray, small: int, large: int, shift: int, edge_grey: float
+) -> np.ndarray:
+    """[lines, places, 1] uint16 P2 for the step to each place; on the first line any."""
+    steps = np.full(grey.shape, large, dtype=np.uint16)
+    places = grey.shape[1]
+    to = slice(max(0, shift), places + min(0, shift))
+    of = slice(max(0, -shift), places + min(0, -shift))
+    change = np.abs(grey[1:, to] - grey[:-1, of])
+    steps[1:, to] = np.maximum(small, np.rint(large / (1 + change / np.float32(edge_grey))))
+    return steps[..., None]
+
 
 A_FACTORS = {Fit.V: 0.03, Fit.PARABOLA: 0.57}
 """What `linearised` needs for Hamming distances over blocks, without grey values: measured on

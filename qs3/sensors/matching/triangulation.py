@@ -9,7 +9,7 @@ import numpy as np
 
 from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import PostFilter, Quantiser
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,54 @@
-"""Who sees what: whether surfaces in an image are reached from another place, by rendering.
-
-A point lamp at that place with a white slide lights exactly what can be seen from there, so any
-renderer answers, with its own geometry.
-"""
+"""Why a pixel of a depth image has a value, or has none."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from enum import IntEnum
 
 import numpy as np
 
 from qs3.geometry.cameras import Camera
-from qs3.sensors.pixel_status import Reason
+from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.base import Body, Projector, Renderer, Scene
+
+
+class Reason(IntEnum):
+    """One for each pixel; what comes first in this list wins where several hold.
+
+    OK: it has a depth.
+    EMPTY: no surface there, or none in reach.
+    SHADOW: the projector does not reach the surface.
+    OCCLUDED: the other camera does not see the surface.
+    OUTSIDE: the other image, or the pattern, ends before it.
+    DARK: too little light or contrast.
+    SATURATED: too much light.
+    AMBIGUOUS: several places match as well.
+    INCONSISTENT: matching the other way round gives another place.
+    RANGE: a depth was found, outside the range of the sensor.
+    FILTERED: a depth was found and a filter removed it.
+    UNMATCHED: none of these, or the matcher does not tell.
+    """
+
+    OK = 0
+    EMPTY = 1
+    SHADOW = 2
+    OCCLUDED = 3
+    OUTSIDE = 4
+    DARK = 5
+    SATURATED = 6
+    AMBIGUOUS = 7
+    INCONSISTENT = 8
+    RANGE = 9
+    FILTERED = 10
+    UNMATCHED = 11
+
+
+def first_reason(causes: Mapping[Reason, np.ndarray], otherwise: Reason) -> np.ndarray:
+    """[h, w] uint8: of each pixel the first reason whose mask [h, w] holds, else `otherwise`."""
+    reasons = [np.uint8(reason) for reason in causes]
+    return np.select(list(causes.values()), reasons, np.uint8(otherwise)).astype(np.uint8)
+
 
 _WHITE = np.ones((2, 2), dtype=np.float32)
 _WIDE = 10.0  # tangent of half the lamp's angle: all that lies before it
@@ -55,3 +91,39 @@ def explained(
     out[invalid & ~lit] = Reason.SHADOW
     out[invalid & ~np.isfinite(clean_m)] = Reason.EMPTY
     return out
+
+
+_ROOM = 1.1  # the plane and the slide are larger than the view by this factor
+
+
+def sample_centres(
+    camera: Camera, renderer: Renderer, seed: int, *, along_rows: bool
+) -> np.ndarray:
+    """The mean column, or with `along_rows` the mean row, of each pixel's samples.
+
+    Args:
+        camera: with its window.
+        renderer: asked for one image.
+        seed: of the images that are to be corrected, rendered with one camera a call.
+
+    Returns:
+        [h, w] float64, in px of the whole image: u (or v) plus some hundredths.
+    """
+    k, window = camera.intrinsics, camera.rendered
+    ends_x = np.abs(np.array([window.left - 1, window.left + window.width]) - k.cx_px)
+    ends_y = np.abs(np.array([window.top - 1, window.top + window.height]) - k.cy_px)
+    half = _ROOM * float(max(ends_x.max(), ends_y.max())) / k.focal_px
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half * _ROOM
+    local = np.column_stack([corners, np.ones(4)])
+    pose = camera.world_from_camera
+    vertices = local @ pose[:3, :3].T + pose[:3, 3]
+    plane = Body(Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]])), albedo=1.0)
+    # At least as fine as the pixels: hardware interpolates with few bits between two of them.
+    count = int(np.ceil(2 * half * k.focal_px))
+    ramp = (np.arange(count, dtype=np.float32) + np.float32(0.5)) / np.float32(count)
+    slide = np.broadcast_to(ramp[:, None] if along_rows else ramp, (count, count))
+    # A plane at distance 1 that faces a projector of strength 1 shows the slide itself.
+    projector = Projector(pose, np.ascontiguousarray(slide), half)
+    (image,) = renderer.render(Scene((plane,), projector), [camera], seed=seed, geometry=[False])
+    place = half * (2 * image.radiance.astype(np.float64) - 1)
+    return place * k.focal_px + (k.cy_px if along_rows else k.cx_px)

@@ -18,7 +18,7 @@ import numpy as np
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.meshes.mesh import Mesh
-from qs3.sensors.renderers import llvm, llvm_width
+from qs3.sensors.renderers import llvm
 from qs3.sensors.renderers.base import (
     Body,
     Image,
@@ -106,7 +106,7 @@ class MitsubaRenderer:
         if self._probe.llvm_path is not None:
             number = ".".join(map(str, llvm.libllvm_version(self._probe.llvm_path)))
             found["llvm"] = number or os.path.basename(self._probe.llvm_path)
-        if self._width not in (None, llvm_width.WIDTH):
+        if self._width not in (None, llvm.WIDTH):
             found["width"] = str(self._width or "unknown")  # other bytes than elsewhere
         return found
 
@@ -135,7 +135,7 @@ class MitsubaRenderer:
             raise RenderError(
                 f"Mitsuba variant {self.variant} cannot be loaded: {error}"
             ) from error
-        self._width = llvm_width.fix_width() if self.variant.startswith("llvm_") else None
+        self._width = llvm.fix_width() if self.variant.startswith("llvm_") else None
         threads = self.settings.threads or os.cpu_count() or 1
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)

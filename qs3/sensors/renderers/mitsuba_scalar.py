@@ -9,7 +9,7 @@ import numpy as np
 
 from qs3.geometry.cameras import Camera
 from qs3.sensors.renderers.base import Projector, Scene, tangents
-from qs3.sensors.renderers.faces import Faces, mitsuba_mesh
+from qs3.sensors.renderers.mitsuba_jit import Faces, mitsuba_mesh
 
 
 class ScalarScene:

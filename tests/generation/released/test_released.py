@@ -14,8 +14,8 @@ from qs3.geometry.cameras import look_at, project, rotation_xyz
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.optics.blender_filmic import FilmicCamera
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.infrared import FilmicCamera
+from qs3.sensors.optics.visibility import Reason
 from qs3.sensors.renderers.base import Body
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.generation.generating import composed as config

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.blensor_kinect import DotMask, spread
 from qs3.sensors.matching.filters import Quantiser
+from qs3.sensors.optics.misalignment import smooth_field
 from qs3.sensors.optics.patterns import Speckle
-from qs3.sensors.optics.smooth_field import smooth_field
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from tests.sensors.scenery import middle, rectangle, scan, square
 
 KINECT = DotMask()

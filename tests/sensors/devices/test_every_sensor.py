@@ -13,7 +13,7 @@ from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.devices.time_of_flight import TimeOfFlight
 from qs3.sensors.matching import StereoBlockMatcher
 from qs3.sensors.optics.fringe_code import FringeCode
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.sensors.scenery import POSE, box_of, middle, plane, scan, square

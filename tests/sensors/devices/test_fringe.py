@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.devices.fringe import FringeProjection
 from qs3.sensors.optics.fringe_code import FringeCode, phase_of
-from qs3.sensors.optics.subpixel_offsets import sample_centres
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason, sample_centres
 from qs3.sensors.renderers.base import Projector, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer

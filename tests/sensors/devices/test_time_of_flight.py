@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from qs3.sensors.base import on_grid
 from qs3.sensors.devices.gaussian_time_of_flight import GaussianTimeOfFlight
 from qs3.sensors.devices.time_of_flight import SPEED_OF_LIGHT, TimeOfFlight, unwrapped
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from tests.sensors.scenery import box_of, middle, rectangle, scan, square
 
 CAMERA = TimeOfFlight()

@@ -9,12 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.sensors.matching import CensusMatcher
-from qs3.sensors.matching.census import _best_of_other
+from qs3.sensors.matching.base import Fit, linearised, offset
+from qs3.sensors.matching.census import _best_of_other, aggregate, census, count_ones
 from qs3.sensors.matching.filters import Quantiser
-from qs3.sensors.matching.hamming import census, count_ones
-from qs3.sensors.matching.semiglobal import aggregate
-from qs3.sensors.matching.subpixel import Fit, linearised, offset
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 
 FINE = 16  # positions a pixel along a row, and phases
 
@@ -127,7 +125,7 @@ def test_path_sums_equal_a_recursion_by_hand(paths, edge):
 def test_rows_are_the_same_however_they_are_cut_for_the_horizontal_paths(monkeypatch):
     cost = np.random.default_rng(0).integers(0, 900, (11, 9, 6)).astype(np.uint16)
     whole = aggregate(cost, 20, 90, 8)
-    monkeypatch.setattr("qs3.sensors.matching.semiglobal.STRIP_ROWS", 3)
+    monkeypatch.setattr("qs3.sensors.matching.census.STRIP_ROWS", 3)
     np.testing.assert_array_equal(aggregate(cost, 20, 90, 8), whole)
 
 

@@ -14,7 +14,7 @@ from qs3.sensors.matching.filters import (
     SpatialFilter,
 )
 from qs3.sensors.matching.triangulation import Triangulation
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 
 MAPS = arrays(
     np.float32,

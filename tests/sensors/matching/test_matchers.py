@@ -13,7 +13,7 @@ from qs3.sensors.matching import (
 )
 from qs3.sensors.matching.base import found_px
 from qs3.sensors.matching.filters import Quantiser
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from tests.sensors.matching.textures import FINE, dots, seen
 
 MATCHERS = {

@@ -8,7 +8,7 @@ from qs3.sensors.matching import (
     SemiGlobalMatcher,
     StereoBlockMatcher,
 )
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from tests.sensors.matching.textures import dots, seen
 
 

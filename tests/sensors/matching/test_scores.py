@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from qs3.sensors.matching import NormalisedCorrelation, ReferenceMatcher, scores
 from qs3.sensors.matching.scores import correlation, winner
+
+from qs3.sensors.matching import NormalisedCorrelation, ReferenceMatcher
+from qs3.sensors.matching import correlation as scores
 from tests.sensors.matching.textures import dots, seen
 
 FIELDS = ("place", "top", "lower", "upper", "second")

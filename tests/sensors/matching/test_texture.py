@@ -5,9 +5,9 @@ import pytest
 
 from qs3.errors import ConfigError
 from qs3.sensors.matching import CensusMatcher
-from qs3.sensors.matching.texture import TextureOverNoise, for_picture, window_moments
+from qs3.sensors.matching.base import TextureOverNoise, for_picture, window_moments
 from qs3.sensors.optics.infrared import GreyNoise, InfraredCamera
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 
 CAMERA = InfraredCamera(electrons_at_white=3000.0, read_noise_e=25.0)
 ASKED = TextureOverNoise(0.7, CAMERA.electrons_at_white, CAMERA.read_noise_e)

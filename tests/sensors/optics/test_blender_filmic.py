@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.sensors.optics.blender_filmic import FilmicCamera, filmic
+from qs3.sensors.optics.infrared import FilmicCamera, filmic
 
 BLENDER = """
 import sys

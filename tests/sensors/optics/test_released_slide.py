@@ -11,9 +11,8 @@ from qs3.geometry.cameras import look_at
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.matching import StereoBlockMatcher
-from qs3.sensors.optics.blender_filmic import FilmicCamera
-from qs3.sensors.optics.patterns import Speckle
-from qs3.sensors.optics.released_slide import ReleasedSlide
+from qs3.sensors.optics.infrared import FilmicCamera
+from qs3.sensors.optics.patterns import ReleasedSlide, Speckle
 from qs3.sensors.renderers.base import Body
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 

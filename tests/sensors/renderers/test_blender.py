@@ -8,8 +8,7 @@ import pytest
 
 from qs3.errors import RenderError
 from qs3.sensors.renderers import blender
-from qs3.sensors.renderers.blender import BlenderRenderer
-from qs3.sensors.renderers.exr import read_exr
+from qs3.sensors.renderers.blender import BlenderRenderer, read_exr
 from tests.sensors.renderers.scenes import busy_camera, busy_scene
 
 

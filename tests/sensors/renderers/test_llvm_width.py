@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from qs3.meshes.mesh import Mesh
-from qs3.sensors.renderers import llvm_width
+from qs3.sensors.renderers import llvm
 from qs3.sensors.renderers.base import Body, Image, Scene
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.sensors.renderers.scenes import busy_camera, busy_scene, wall
@@ -52,7 +52,7 @@ def test_whatever_the_processor_would_take(renderer, monkeypatch, width):
     with monkeypatch.context() as patched:
         patched.setattr(llvm_width, "WIDTH", width)
         other = rendered(renderer)
-        assert llvm_width.fix_width() == width
+        assert llvm.fix_width() == width
     after = rendered(renderer)
     np.testing.assert_array_equal(after.radiance, before.radiance)
     np.testing.assert_array_equal(after.depth_m, before.depth_m)
