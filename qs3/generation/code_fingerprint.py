@@ -24,7 +24,7 @@ MAKES_CLOUDS = (
         "utils/seeding.py",
     ),
     *("geometry/cameras.py", "geometry/sampling.py"),
-    *("sensors/base.py", "sensors/pixel_status.py", "sensors/devices", "sensors/matching"),
+    *("sensors/base.py", "sensors/devices", "sensors/matching"),
     *("sensors/optics", "sensors/renderers"),
 )
 HARMLESS = ("cluster", "config", "store", "datasets", "errors", "utils")

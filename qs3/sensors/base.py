@@ -8,14 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window, project
 from qs3.sensors.matching import Match, StereoBlockMatcher
 from qs3.sensors.matching.filters import PostFilter, Quantiser
-from qs3.sensors.matching.triangulation import Triangulation
-from qs3.sensors.optics.visibility import explained, reached_from
+from qs3.sensors.optics.visibility import Reason, explained, reached_from
 from qs3.sensors.renderers.base import AreaLight, Body, Image, Projector, Renderer, Scene
+from qs3.utils.settings import Count, Positive, settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +208,7 @@ class Shot:
         )
 
 
-@dataclass(frozen=True)
+@settings
 class DepthSensor(ABC):
     """A depth camera that looks at bodies through a renderer. A kind of sensor writes `take`.
 
@@ -224,9 +222,9 @@ class DepthSensor(ABC):
     sees_light: ClassVar[bool] = True
     sees_bounces: ClassVar[bool] = True
 
-    width_px: int = 640
-    height_px: int = 480
-    focal_px: float = 580.0
+    width_px: Count = 640
+    height_px: Count = 480
+    focal_px: Positive = 580.0
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -276,9 +274,9 @@ class DepthSensor(ABC):
         """Render, expose and measure; None if the box is outside another camera's view."""
 
 
-@dataclass(frozen=True)
+@settings
 class TriangulatingSensor(DepthSensor):
-    """A sensor whose depth is f b / disparity.
+    """A sensor whose depth is f b / (disparity + d0); d0 is 0 for two parallel cameras.
 
     Attributes:
         baseline_m: b, to the right of the camera unless the sensor says otherwise.
@@ -287,24 +285,19 @@ class TriangulatingSensor(DepthSensor):
         filters: applied to the disparity in this order, before the quantiser.
     """
 
-    baseline_m: float = 0.075
-    min_depth_m: float = 0.7
-    max_depth_m: float = 6.0
+    baseline_m: Positive = 0.075
+    min_depth_m: Positive = 0.7
+    max_depth_m: Positive = 6.0
     quantiser: Quantiser = field(default_factory=Quantiser)
     filters: tuple[PostFilter, ...] = ()
 
     def __post_init__(self) -> None:
-        check_ranges(self, "sensor.", baseline_m="> 0")
-        check_depths(self)
-        matcher, steps = self._matcher, self.quantiser.steps_per_px
+        assert self.min_depth_m < self.max_depth_m, "min_depth_m must be below max_depth_m"
+        matcher = self._matcher
         unbiased = isinstance(matcher, StereoBlockMatcher) and matcher.remove_bias
         # k / 16 less nearly half a step would be rounded straight back to k / 16.
-        if unbiased and steps == matcher.steps_per_px:
-            raise ConfigError(
-                f"sensor.quantiser.steps_per_px={steps} are StereoBM's own steps, and rounding to "
-                "them again undoes sensor.matcher.remove_bias: set it to 0, to another number such "
-                "as 8 or 32, or set sensor.matcher.remove_bias=false"
-            )
+        undone = unbiased and self.quantiser.steps_per_px == matcher.steps_per_px
+        assert not undone, "quantiser.steps_per_px=16 undoes matcher.remove_bias"
 
     @property
     def _matcher(self) -> Any:
@@ -329,30 +322,32 @@ class TriangulatingSensor(DepthSensor):
         own: int = getattr(self._matcher, "steps_per_px", 0)
         return min(steps, own) if steps and own else steps or own
 
-    def depth_step_m(self, depth_m: float) -> float:
-        """Depth that one step of the disparity makes: Z^2 / (steps f b); 0 without steps."""
-        steps = self.steps_per_px
-        return depth_m**2 / (steps * self.focal_px * self.baseline_m) if steps else 0.0
-
     def depth_of(self, match: Match) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Depth, disparity and reason [h, w]; see `Triangulation.depth`."""
-        lens = Triangulation(
-            self.focal_px,
-            self.baseline_m,
-            self.zero_disparity_px,
-            self.min_depth_m,
-            self.max_depth_m,
-        )
-        return lens.depth(match, self.quantiser, self.filters)
+        """Filter, quantise, triangulate, in this order.
 
-
-def check_depths(sensor: Any) -> None:
-    """Raise ConfigError unless 0 < min_depth_m < max_depth_m."""
-    if not 0 < sensor.min_depth_m < sensor.max_depth_m:
-        raise ConfigError(
-            "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
-            f"{sensor.min_depth_m} and {sensor.max_depth_m}"
-        )
+        Returns:
+            [h, w] float32 depth in metres with NaN; [h, w] float32 disparity as used, with NaN;
+            [h, w] uint8 `Reason`.
+        """
+        disparity, reason = match.disparity, match.reason
+        for post in self.filters:
+            before = np.isfinite(disparity)
+            disparity = post.apply(disparity)
+            dropped = before & ~np.isfinite(disparity)
+            filled = ~before & np.isfinite(disparity)
+            reason = np.where(dropped, np.uint8(Reason.FILTERED), reason)
+            reason = np.where(filled, np.uint8(Reason.OK), reason)
+        disparity = self.quantiser.apply(disparity)
+        scale = self.focal_px * self.baseline_m
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = disparity / np.float32(scale)
+            if self.zero_disparity_px:
+                inverse = inverse + np.float32(self.zero_disparity_px / scale)
+            depth = (1 / inverse).astype(np.float32)
+            inside = (depth > self.min_depth_m) & (depth < self.max_depth_m)
+        reason = np.where(np.isfinite(disparity) & ~inside, np.uint8(Reason.RANGE), reason)
+        depth[~inside] = np.nan
+        return depth, disparity, reason.astype(np.uint8)
 
 
 def window_of(box_m: np.ndarray, camera: Camera, *, margin_px: int = 0) -> Window | None:

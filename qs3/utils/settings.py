@@ -14,13 +14,28 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, TypeVar, dataclass_transform
+from typing import Annotated, Any, TypeVar, dataclass_transform
 
+from annotated_types import Ge, Gt, Interval, Predicate
 from pydantic import ConfigDict, ValidationError, validate_call
 from pydantic.dataclasses import dataclass as _dataclass
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
+
+Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
+Share = Annotated[float, Interval(ge=0, le=1)]
+Count = Annotated[int, Ge(1)]
+
+
+def is_odd(value: int) -> bool:
+    """Whether a whole number is odd."""
+    return value % 2 == 1
+
+
+IsOdd = Predicate(is_odd)
+
 _CONFIG = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
 
 
@@ -38,10 +53,13 @@ def checked(function: F) -> F:
 
 def problems(error: ValidationError, place: str = "") -> str:
     """A pydantic ValidationError in a line: each key with what is wrong."""
-    return "; ".join(
-        f"{'.'.join([place] * bool(place) + [str(p) for p in one['loc'] if isinstance(p, str)])}: "
-        f"{one['msg']}, got {one['input']!r}"
-        if one["type"] != "missing"
-        else f"{'.'.join(map(str, one['loc']))}= is missing"
-        for one in error.errors(include_url=False)
-    )
+    lines = []
+    for one in error.errors(include_url=False):
+        where = ".".join([place] * bool(place) + [str(p) for p in one["loc"] if isinstance(p, str)])
+        if one["type"] == "missing":
+            lines.append(f"{where}= is missing")
+        elif one["type"] == "assertion_error":  # of several fields together
+            lines.append(f"{where}: {one['msg'].removeprefix('Assertion failed, ')}")
+        else:
+            lines.append(f"{where}: {one['msg']}, got {one['input']!r}")
+    return "; ".join(lines)

@@ -16,13 +16,13 @@ about that of gradient noise of strength 0.25.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import product
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Ge, Interval
 
-from qs3.config.checks import check_ranges
 from qs3.geometry.cameras import Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
@@ -30,9 +30,10 @@ from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.optics.misalignment import smooth_field
 from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.optics.visibility import explained, white_lamp
+from qs3.utils.settings import Count, IsOdd, NotNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class DotMask(TriangulatingSensor):
     """A camera and a projector of dots next to it, without light: geometry decides.
 
@@ -51,30 +52,18 @@ class DotMask(TriangulatingSensor):
     """
 
     sees_light: ClassVar[bool] = False
-    step_px: int = 1
+    step_px: Count = 1
     pattern: Speckle = field(
         default_factory=lambda: Speckle(columns=633, rows=495, tiles=1, dot_px=1, seed=2)
     )
-    window_px: int = 9
-    min_share: float = 2 / 3
-    inlier_m: float = 0.05
-    fill_px: float = 3.1
-    column_sigma_px: float = 0.0
-    field_sigma_px: float = 0.06
-    field_cell_px: float = 32.0
+    window_px: Annotated[int, Ge(1), IsOdd] = 9
+    min_share: Annotated[float, Interval(ge=0, lt=1)] = 2 / 3
+    inlier_m: Positive = 0.05
+    fill_px: NotNegative = 3.1
+    column_sigma_px: NotNegative = 0.0
+    field_sigma_px: NotNegative = 0.06
+    field_cell_px: Positive = 32.0
     quantiser: Quantiser = field(default_factory=lambda: Quantiser(8))
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ranges(
-            self,
-            "sensor.",
-            **dict.fromkeys(("inlier_m", "field_cell_px"), "> 0"),
-            **dict.fromkeys(("fill_px", "column_sigma_px", "field_sigma_px"), ">= 0"),
-            step_px=">= 1",
-            window_px="odd >= 1",
-            min_share="[0, 1)",
-        )
 
     @property
     def margin_px(self) -> int:

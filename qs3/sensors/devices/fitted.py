@@ -7,21 +7,20 @@ presets of this sensor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
+from annotated_types import Interval
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics
-from qs3.sensors.base import DepthFrame, DepthSensor, Shot, check_depths
+from qs3.sensors.base import DepthFrame, DepthSensor, Shot
 from qs3.sensors.optics.visibility import Reason, first_reason
-from qs3.utils.plural import counted
+from qs3.utils.settings import Count, NotNegative, Positive, Share, settings
 
 
-@dataclass(frozen=True)
+@settings
 class FittedDepth(DepthSensor):
     """An empirical depth camera.
 
@@ -41,7 +40,6 @@ class FittedDepth(DepthSensor):
         bias_m: coefficients of bias(Z), the constant first.
         tilts_deg, fill_rates: share of valid pixels at these angles of incidence, interpolated
             in between and constant outside.
-        hole_px: size of holes, standard deviation of the Gaussian behind them; 0: single pixels.
         baseline_m: projector minus camera along the camera's x; what it does not reach is not
             measured. null: no shadows.
     """
@@ -49,35 +47,24 @@ class FittedDepth(DepthSensor):
     sees_light: ClassVar[bool] = False
     cx_px: float | None = None
     cy_px: float | None = None
-    step_px: int = 1
-    min_depth_m: float = 0.3
-    max_depth_m: float = 8.0
-    noise_floor_m: float = 0.0
-    noise_factor: float = 0.0015
+    step_px: Count = 1
+    min_depth_m: Positive = 0.3
+    max_depth_m: Positive = 8.0
+    noise_floor_m: NotNegative = 0.0
+    noise_factor: NotNegative = 0.0015
     noise_power: float = 2.0
-    correlation_px: float = 0.0
-    inverse_step_per_m: float = 0.0
-    depth_step_m: float = 0.0
+    correlation_px: Annotated[float, Interval(ge=0, le=50)] = 0.0
+    inverse_step_per_m: NotNegative = 0.0
+    depth_step_m: NotNegative = 0.0
     bias_m: tuple[float, ...] = (0.0,)
     tilts_deg: tuple[float, ...] = (0.0,)
-    fill_rates: tuple[float, ...] = (1.0,)
-    hole_px: float = 0.0
+    fill_rates: tuple[Share, ...] = (1.0,)
     baseline_m: float | None = None
 
     def __post_init__(self) -> None:
-        lengths = ("noise_floor_m", "noise_factor", "inverse_step_per_m", "depth_step_m")
-        check_ranges(self, "sensor.", **dict.fromkeys(lengths, ">= 0"))
-        check_ranges(self, "sensor.", correlation_px="[0, 50]", hole_px="[0, 50]", step_px=">= 1")
-        check_depths(self)
-        if len(self.tilts_deg) != len(self.fill_rates) or not self.tilts_deg:
-            raise ConfigError(
-                f"sensor.tilts_deg has {counted(len(self.tilts_deg), 'value')} and fill_rates "
-                f"{len(self.fill_rates)}: give as many of each, one at least"
-            )
-        if any(b <= a for a, b in zip(self.tilts_deg, self.tilts_deg[1:], strict=False)):
-            raise ConfigError(f"sensor.tilts_deg must increase, got {list(self.tilts_deg)}")
-        if not all(0 <= rate <= 1 for rate in self.fill_rates):
-            raise ConfigError(f"sensor.fill_rates must be in 0..1, got {list(self.fill_rates)}")
+        assert self.min_depth_m < self.max_depth_m, "min_depth_m must be below max_depth_m"
+        assert len(self.tilts_deg) == len(self.fill_rates) > 0, "as many tilts_deg as fill_rates"
+        assert self.tilts_deg == tuple(sorted(set(self.tilts_deg))), "tilts_deg must increase"
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -103,10 +90,7 @@ class FittedDepth(DepthSensor):
         Returns:
             [h, w] float32 depth with NaN; [h, w] uint8 `Reason`.
         """
-        noise, holes = (
-            _smooth(clean_m.shape, size / self.step_px, rng)
-            for size in (self.correlation_px, self.hole_px)
-        )
+        noise = _smooth(clean_m.shape, self.correlation_px / self.step_px, rng)
         hit = np.isfinite(clean_m)
         true = np.where(hit, clean_m, 1.0).astype(np.float64)
         sigma = self.noise_floor_m + self.noise_factor * true**self.noise_power
@@ -119,7 +103,7 @@ class FittedDepth(DepthSensor):
             found = np.rint(found / self.depth_step_m) * self.depth_step_m
         tilt = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
         rate = np.interp(tilt, self.tilts_deg, self.fill_rates)
-        lost = _share_below(holes) >= rate
+        lost = rng.random(clean_m.shape) >= rate
         inside = (found > self.min_depth_m) & (found < self.max_depth_m)
         reason = first_reason(
             {Reason.EMPTY: ~hit, Reason.UNMATCHED: lost, Reason.RANGE: ~inside}, Reason.OK
@@ -140,12 +124,6 @@ class FittedDepth(DepthSensor):
         return shot.frame(depth, reason, image, pictures, at)
 
 
-def neighbour_correlation(size_px: float) -> float:
-    """Correlation of horizontal neighbours in noise that `correlation_px` = size_px smooths."""
-    kernel = _kernel(size_px)
-    return float((kernel[1:] * kernel[:-1]).sum() / (kernel**2).sum())
-
-
 def _kernel(size_px: float) -> np.ndarray:
     """[k] float32 Gaussian that sums to 1."""
     reach = max(1, round(4 * size_px))
@@ -161,10 +139,3 @@ def _smooth(shape: tuple[int, ...], size_px: float, rng: np.random.Generator) ->
     white = rng.standard_normal([side + 2 * reach for side in shape], dtype=np.float32)
     smooth = cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel)[reach:-reach, reach:-reach]
     return smooth / np.float32((kernel**2).sum())
-
-
-def _share_below(normal: np.ndarray) -> np.ndarray:
-    """Distribution function of the normal law: uniform in 0..1."""
-    from scipy.special import ndtr
-
-    return ndtr(normal)

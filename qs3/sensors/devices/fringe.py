@@ -16,21 +16,22 @@ scene must stand still meanwhile, as it does here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
 from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.visibility import Reason, first_reason, sample_centres
 from qs3.sensors.renderers.base import Image, Projector, tangents
+from qs3.utils.settings import NotNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class FringeProjection(TriangulatingSensor):
     """A camera and a projector of fringes to the right of it or above. All numbers are ours.
 
@@ -46,32 +47,20 @@ class FringeProjection(TriangulatingSensor):
             0.5 accepts all) are ambiguous.
     """
 
-    focal_px: float = 600.0
-    baseline_m: float = 0.15
-    min_depth_m: float = 0.4
-    tan_half_width: float = 0.6
-    projector_strength: float = 1.0
-    ambient: float = 0.01
+    focal_px: Positive = 600.0
+    baseline_m: Positive = 0.15
+    min_depth_m: Positive = 0.4
+    tan_half_width: Positive = 0.6
+    projector_strength: Positive = 1.0
+    ambient: NotNegative = 0.01
     code: FringeCode = field(default_factory=FringeCode)
     infrared: InfraredCamera = field(default_factory=InfraredCamera)
-    min_modulation: float = 10.0
-    max_misfit: float = 0.35
+    min_modulation: NotNegative = 10.0
+    max_misfit: Annotated[float, Interval(gt=0, le=0.5)] = 0.35
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ranges(
-            self,
-            "sensor.",
-            **dict.fromkeys(("tan_half_width", "projector_strength"), "> 0"),
-            ambient=">= 0",
-            min_modulation=">= 0",
-            max_misfit="(0, 0.5]",
-        )
-        if self.infrared.needs_ambient:
-            raise ConfigError(
-                "sensor.infrared.ambient_speckles=false is for sensors that project speckle; leave "
-                "it out for fringes"
-            )
+        assert not self.infrared.needs_ambient, "ambient_speckles=false is for speckle projectors"
 
     @property
     def margin_px(self) -> int:

@@ -7,18 +7,17 @@ frequency can tell apart. For physics see qs3.sensors.devices.time_of_flight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from qs3.config.checks import check_ranges
 from qs3.sensors.base import DepthFrame, DepthSensor, Shot
 from qs3.sensors.optics.visibility import Reason, first_reason
 from qs3.sensors.renderers.base import tangents
+from qs3.utils.settings import Count, NotNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class GaussianTimeOfFlight(DepthSensor):
     """Distance with a normal error.
 
@@ -35,25 +34,15 @@ class GaussianTimeOfFlight(DepthSensor):
     """
 
     sees_light: ClassVar[bool] = False
-    width_px: int = 176
-    height_px: int = 144
-    focal_px: float = 220.0
-    step_px: int = 1
+    width_px: Count = 176
+    height_px: Count = 144
+    focal_px: Positive = 220.0
+    step_px: Count = 1
     noise_mean_m: float = 0.0
-    noise_sigma_m: float = 0.004
+    noise_sigma_m: NotNegative = 0.004
     backfolding: bool = False
-    unambiguous_m: float = 5.0
-    max_distance_m: float = 20.0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            "sensor.",
-            step_px=">= 1",
-            noise_sigma_m=">= 0",
-            unambiguous_m="> 0",
-            max_distance_m="> 0",
-        )
+    unambiguous_m: Positive = 5.0
+    max_distance_m: Positive = 20.0
 
     def take(self, shot: Shot) -> DepthFrame:
         """See `DepthSensor.take`. There is nothing to explain."""

@@ -8,22 +8,22 @@ u - u_ref = f b (1 / Z - 1 / Z_ref) (Khoshelham and Elberink, Sensors 2012, eq. 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 
 import cv2
 import numpy as np
 
-from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Matcher, ReferenceMatcher
 from qs3.sensors.matching.base import for_picture, found_px
 from qs3.sensors.optics.infrared import InfraredCamera
-from qs3.sensors.optics.patterns import Slide, Speckle
+from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.renderers.base import Projector
+from qs3.utils.settings import NotNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class ReferenceSpeckle(TriangulatingSensor):
     """A single infrared camera and a projector next to it.
 
@@ -38,10 +38,10 @@ class ReferenceSpeckle(TriangulatingSensor):
             own, beside which a finer one of the sensor changes nothing.
     """
 
-    reference_m: float = 1.6
-    tan_half_width: float = 0.62
-    ambient: float = 0.25
-    pattern: Slide = field(
+    reference_m: Positive = 1.6
+    tan_half_width: Positive = 0.62
+    ambient: NotNegative = 0.25
+    pattern: Speckle = field(
         default_factory=lambda: Speckle(columns=211, rows=165, tiles=3, dot_px=1, seed=1)
     )
     matcher: Matcher = field(default_factory=ReferenceMatcher)
@@ -53,12 +53,10 @@ class ReferenceSpeckle(TriangulatingSensor):
         super().__post_init__()
         low, high = (self.disparity(z) for z in (self.max_depth_m, self.min_depth_m))
         least, most = found_px(self.matcher)
-        if low < least or high > most:
-            raise ConfigError(
-                f"depths {self.min_depth_m} to {self.max_depth_m} m need disparities "
-                f"{low:.1f} to {high:.1f} px, but the matcher finds {least:g} to {most:g}: "
-                "change sensor.reference_m or the matcher's range"
-            )
+        assert least <= low < high <= most, (
+            f"the depths need disparities {low:.1f} to {high:.1f} px, the matcher finds {least:g} "
+            f"to {most:g}"
+        )
 
     def disparity(self, depth_m: float) -> float:
         """Disparity in px of a plane at `depth_m`."""

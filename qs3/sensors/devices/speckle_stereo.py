@@ -11,26 +11,26 @@ after its down-sampling, by up to two), and StereoBM's bias of 0.029 px.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import field, replace
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
 from qs3.sensors.matching import Match, Matcher, StereoBlockMatcher
 from qs3.sensors.matching.base import for_picture, found_px
 from qs3.sensors.optics.infrared import FilmicCamera, InfraredCamera
 from qs3.sensors.optics.misalignment import Misalignment
-from qs3.sensors.optics.patterns import Slide, Speckle
+from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.optics.visibility import Reason
 from qs3.sensors.renderers.base import Image, Projector
+from qs3.utils.settings import Count, NotNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class SpeckleStereo(TriangulatingSensor):
     """An active stereo depth camera; the projector is half-way between its two cameras.
 
@@ -54,56 +54,33 @@ class SpeckleStereo(TriangulatingSensor):
         misalignment: what the calibration of the two cameras leaves; by default nothing.
     """
 
-    width_px: int = 1080
-    height_px: int = 1080
-    focal_px: float = 1500.0
-    baseline_m: float = 0.1
-    step_px: int = 4
-    min_depth_m: float = 1.0
-    max_depth_m: float = 6.0
-    tan_half_width: float = 0.625
-    ambient: float = 0.15
-    pattern: Slide = field(default_factory=Speckle)
+    width_px: Count = 1080
+    height_px: Count = 1080
+    focal_px: Positive = 1500.0
+    baseline_m: Positive = 0.1
+    step_px: Count = 4
+    min_depth_m: Positive = 1.0
+    max_depth_m: Positive = 6.0
+    tan_half_width: Positive = 0.625
+    ambient: NotNegative = 0.15
+    pattern: Speckle = field(default_factory=Speckle)
     matcher: Matcher = field(default_factory=StereoBlockMatcher)
     infrared: InfraredCamera | FilmicCamera = field(default_factory=InfraredCamera)
-    projector_strength: float = 16.0
-    sample_offset_px: int | None = None
+    projector_strength: Positive = 16.0
+    sample_offset_px: Annotated[int, Ge(0)] | None = None
     centre_error_px: float = 0.0
-    blind_left_px: int = 0
+    blind_left_px: Annotated[int, Ge(0)] = 0
     misalignment: Misalignment = field(default_factory=Misalignment)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.misalignment, Mapping):
-            # `+sensor.misalignment.rows_px=0.2` on a preset whose file says nothing of it.
-            object.__setattr__(self, "misalignment", Misalignment.of(self.misalignment))
-        check_ranges(
-            self,
-            "sensor.",
-            step_px=">= 1",
-            projector_strength="> 0",
-            blind_left_px=f"[0, {self.width_px})",
-        )
-        if self.sample_offset_px is not None and not 0 <= self.sample_offset_px < self.step_px:
-            raise ConfigError(
-                f"sensor.sample_offset_px must be null or in 0..{self.step_px - 1} (step_px is "
-                f"{self.step_px}), got {self.sample_offset_px}"
-            )
+        assert (self.sample_offset_px or 0) < self.step_px, "sample_offset_px must be in a step"
         scale, (least, most) = self.focal_px * self.baseline_m, found_px(self.matcher)
-        if scale / self.min_depth_m > most:
-            raise ConfigError(
-                f"sensor.min_depth_m {self.min_depth_m} is nearer than the matcher reaches: "
-                f"it finds disparities up to {most:g} px, from "
-                f"{math.ceil(100 * scale / most) / 100:g} m on; set that, or a larger "
-                "sensor.matcher.num_disparities"
-            )
-        if scale / self.max_depth_m < least:
-            raise ConfigError(
-                f"sensor.max_depth_m {self.max_depth_m} is farther than the matcher reaches: "
-                f"it finds disparities from {least:g} px on, up to "
-                f"{math.floor(100 * scale / least) / 100:g} m; set that, or a smaller "
-                "sensor.matcher.min_disparity"
-            )
+        low, high = scale / self.max_depth_m, scale / self.min_depth_m
+        assert least <= low < high <= most, (
+            f"the depths need disparities {low:.1f} to {high:.1f} px, the matcher finds {least:g} "
+            f"to {most:g}"
+        )
 
     @property
     def margin_px(self) -> int:

@@ -30,17 +30,16 @@ it went; higher harmonics of the modulation; motion between buckets.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Ge, Interval, MinLen
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, DepthSensor, Shot, check_depths
+from qs3.sensors.base import DepthFrame, DepthSensor, Shot
 from qs3.sensors.optics.visibility import Reason, first_reason, white_lamp
 from qs3.sensors.renderers.base import Image, Scene
+from qs3.utils.settings import Count, IsOdd, NotNegative, Positive, settings
 
 SPEED_OF_LIGHT = 299_792_458.0
 """Metres a second."""
@@ -48,7 +47,7 @@ _ALL_TURNS = 64
 """Up to so many periods all are tried, so that what lies out of range is seen to."""
 
 
-@dataclass(frozen=True)
+@settings
 class TimeOfFlight(DepthSensor):
     """An amplitude-modulated continuous-wave time-of-flight camera.
 
@@ -76,38 +75,24 @@ class TimeOfFlight(DepthSensor):
     """
 
     sees_bounces: ClassVar[bool] = False
-    width_px: int = 320
-    height_px: int = 288
-    focal_px: float = 252.0
+    width_px: Count = 320
+    height_px: Count = 288
+    focal_px: Positive = 252.0
     lamp_offset_m: float = 0.02
-    frequencies_hz: tuple[float, ...] = (80e6, 16e6)
-    contrast: float = 0.7
-    electrons_at_1m: float = 100_000.0
-    read_noise_e: float = 60.0
-    full_well_e: float = 600_000.0
-    ambient: float = 0.02
-    min_amplitude_e: float = 300.0
-    max_disagreement_m: float = 0.3
-    supersampling: int = 3
-    min_depth_m: float = 0.4
-    max_depth_m: float = 6.0
+    frequencies_hz: Annotated[tuple[Annotated[float, Ge(1)], ...], MinLen(1)] = (80e6, 16e6)
+    contrast: Annotated[float, Interval(gt=0, le=1)] = 0.7
+    electrons_at_1m: Positive = 100_000.0
+    read_noise_e: NotNegative = 60.0
+    full_well_e: Positive = 600_000.0
+    ambient: NotNegative = 0.02
+    min_amplitude_e: NotNegative = 300.0
+    max_disagreement_m: Positive = 0.3
+    supersampling: Annotated[int, Ge(1), IsOdd] = 3
+    min_depth_m: Positive = 0.4
+    max_depth_m: Positive = 6.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frequencies_hz", tuple(map(float, self.frequencies_hz)))
-        if not self.frequencies_hz or not all(f >= 1 for f in self.frequencies_hz):
-            raise ConfigError(
-                "sensor.frequencies_hz must hold one frequency or more, in Hz, got "
-                f"{list(self.frequencies_hz)}"
-            )
-        check_ranges(
-            self,
-            "sensor.",
-            contrast="(0, 1]",
-            **dict.fromkeys(("electrons_at_1m", "full_well_e", "max_disagreement_m"), "> 0"),
-            **dict.fromkeys(("read_noise_e", "ambient", "min_amplitude_e"), ">= 0"),
-            supersampling="odd >= 1",
-        )
-        check_depths(self)
+        assert self.min_depth_m < self.max_depth_m, "min_depth_m must be below max_depth_m"
 
     @property
     def margin_px(self) -> int:

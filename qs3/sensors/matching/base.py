@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.sensors.optics.infrared import GreyNoise
 from qs3.sensors.optics.visibility import Reason
+from qs3.utils.settings import NotNegative, Positive, settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +32,7 @@ class Match:
         return Match(disparity, reason.astype(np.uint8))
 
 
+@runtime_checkable
 class Matcher(Protocol):
     """Finds each pixel of one rectified image in another.
 
@@ -135,48 +134,15 @@ def opencv_disparity(
     return disparity, left, place
 
 
-def check_search(num_disparities: int) -> None:
-    """Check how many disparities OpenCV's matchers search.
-
-    Raises:
-        ConfigError: not a positive multiple of 16.
-    """
-    if num_disparities < 16 or num_disparities % 16:
-        raise ConfigError(f"num_disparities must be a multiple of 16, got {num_disparities}")
-
-
-class Fit(StrEnum):
-    """Curve through the cost of the best disparity and its two neighbours.
-
-    PARABOLA: right where costs grow with the square of the distance (squared differences,
-        correlation).
-    V: two lines of equal and opposite slope, right where costs grow linearly (absolute
-        differences, Hamming distances). Shimizu and Okutomi, IJCV 2005, section 2.
-    """
-
-    PARABOLA = "parabola"
-    V = "v"
-
-    @classmethod
-    def of(cls, name: Fit | str) -> Fit:
-        """The fit of this name."""
-        try:
-            return cls(name)
-        except ValueError as error:
-            names = " or ".join(fit.value for fit in cls)
-            raise ConfigError(f"fit must be {names}, got {name!r}") from error
-
-
-def offset(lower: np.ndarray, best: np.ndarray, upper: np.ndarray, fit: Fit) -> np.ndarray:
+def offset(lower: np.ndarray, best: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Position of the minimum, -0.5..0.5 px from the best towards `upper`; float32.
 
-    0 where all three float32 costs are the same; where `best` is not the lowest, as costs before
-    aggregation may be, the nearer end.
+    By two lines of equal and opposite slope through three float32 costs that grow linearly
+    (absolute differences, Hamming distances). Shimizu and Okutomi, IJCV 2005, section 2. 0 where
+    all three are the same; where `best` is not the lowest, as costs before aggregation may be, the
+    nearer end.
     """
-    if fit is Fit.PARABOLA:
-        width = 2 * (lower + upper - 2 * best)
-    else:
-        width = 2 * (np.maximum(lower, upper) - best)
+    width = 2 * (np.maximum(lower, upper) - best)
     half = np.float32(0.5)
     return np.clip((lower - upper) / np.maximum(width, np.float32(1e-6)), -half, half)
 
@@ -198,7 +164,7 @@ def linearised(phase: np.ndarray, a_factor: float) -> np.ndarray:
     return phase + np.float32(a_factor) / turn * np.sin(turn * phase)
 
 
-@dataclass(frozen=True)
+@settings
 class TextureOverNoise:
     """A window is textured if it varies more than the camera's noise lets a flat one vary.
 
@@ -213,24 +179,14 @@ class TextureOverNoise:
         read_noise_e: read-out noise, electrons; null: the camera's.
     """
 
-    ratio: float = 0.7
-    electrons_at_white: float | None = None
-    read_noise_e: float | None = None
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "texture.", ratio="> 0", electrons_at_white="> 0", read_noise_e=">= 0")
+    ratio: Positive = 0.7
+    electrons_at_white: Positive | None = None
+    read_noise_e: NotNegative | None = None
 
     def enough(self, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """[h, w] bool from the mean and the variance of the grey values of each window.
-
-        Raises:
-            ConfigError: nobody has said what the noise is.
-        """
-        if self.electrons_at_white is None or self.read_noise_e is None:
-            raise ConfigError(
-                "matcher.texture goes by the camera's noise, and this camera has none: set "
-                "texture.electrons_at_white and texture.read_noise_e, or texture=null"
-            )
+        """[h, w] bool from the mean and the variance of the grey values of each window."""
+        assert self.electrons_at_white is not None, "a camera without noise takes texture=null"
+        assert self.read_noise_e is not None
         noise = GreyNoise(self.electrons_at_white, self.read_noise_e).variance(mean)
         return variance >= (1 + self.ratio**2) * noise
 

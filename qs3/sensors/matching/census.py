@@ -1,17 +1,23 @@
-"""Census strings and how many of their bits differ."""
+"""Matching by the order of grey values: census strings, semi-global paths.
+
+Semi-global aggregation (Hirschmueller, PAMI 2008, section 2.3): along a path r, with p the pixel
+before on it,
+
+    L(d) = C(d) + min(L_p(d), L_p(d - 1) + P1, L_p(d + 1) + P1, min L_p + P2) - min L_p
+
+and the sum of L over all paths takes the place of C.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Interval
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.sensors.matching.base import (
-    Fit,
     Match,
     TextureOverNoise,
     columns_of,
@@ -20,6 +26,7 @@ from qs3.sensors.matching.base import (
     window_moments,
 )
 from qs3.sensors.optics.visibility import Reason, first_reason
+from qs3.utils.settings import IsOdd, NotNegative, settings
 
 
 def census(image: np.ndarray, window_px: int) -> list[np.ndarray]:
@@ -82,14 +89,7 @@ STRIP_ROWS = 64
 """Rows that are turned at a time for the horizontal paths: some MB, which a cache holds."""
 
 
-def aggregate(
-    cost: np.ndarray,
-    small: int,
-    large: int,
-    paths: int,
-    guide: np.ndarray | None = None,
-    edge_grey: float = 0.0,
-) -> np.ndarray:
+def aggregate(cost: np.ndarray, small: int, large: int, paths: int) -> np.ndarray:
     """Sum of the path costs.
 
     Args:
@@ -97,45 +97,29 @@ def aggregate(
         small: P1, for a step of one disparity between neighbours.
         large: P2, for any larger step.
         paths: 4 (along rows and columns) or 8 (and diagonals).
-        guide: [h, w] grey values; with `edge_grey` g > 0, P2 between two pixels that differ by
-            a grey values is P2 / (1 + a / g), and at least P1.
-        edge_grey: see `guide`; 0 switches it off.
 
     Returns:
         [h, w, D] uint16.
     """
     total = np.zeros_like(cost)
-    grey = None if guide is None or edge_grey <= 0 else guide.astype(np.float32)
     sideways = (-1, 0, 1) if paths == 8 else (0,)
     for shift in sideways:
         for flip in (slice(None), slice(None, None, -1)):
-            picture = None if grey is None else grey[flip]
-            _sweep(cost[flip], total[flip], small, large, shift, picture, edge_grey)
+            _sweep(cost[flip], total[flip], small, large, shift)
     for top in range(0, len(cost), STRIP_ROWS):
         rows = slice(top, top + STRIP_ROWS)
         turned = np.ascontiguousarray(cost[rows].transpose(1, 0, 2))
         total_turned = np.zeros_like(turned)
         for flip in (slice(None), slice(None, None, -1)):
-            picture = None if grey is None else grey[rows].T[flip]
-            _sweep(turned[flip], total_turned[flip], small, large, 0, picture, edge_grey)
+            _sweep(turned[flip], total_turned[flip], small, large, 0)
         total[rows] += total_turned.transpose(1, 0, 2)
     return total
 
 
-def _sweep(
-    cost: np.ndarray,
-    total: np.ndarray,
-    small: int,
-    large: int,
-    shift: int,
-    grey: np.ndarray | None,
-    edge_grey: float,
-) -> None:
+def _sweep(cost: np.ndarray, total: np.ndarray, small: int, large: int, shift: int) -> None:
     """Add to `total` the costs of paths that step from line i - 1, place m - shift to i, m.
 
-    Args:
-        cost, total: [lines, places, D] uint16.
-        grey: [lines, places] float32 or None.
+    `cost` and `total` are [lines, places, D] uint16.
     """
     lines, places, _ = cost.shape
     p1, p2 = np.uint16(small), np.uint16(large)
@@ -146,9 +130,8 @@ def _sweep(
     here = kept[1:-1]
     best = np.empty_like(here)
     step = np.empty_like(here)
-    steps = None if grey is None else _modulated(grey, small, large, shift, edge_grey)
     for i in range(lines):
-        np.minimum(before, p2 if steps is None else steps[i], out=best)
+        np.minimum(before, p2, out=best)
         np.add(before, p1, out=step)
         np.minimum(best[:, 1:], step[:, :-1], out=best[:, 1:])
         np.minimum(best[:, :-1], step[:, 1:], out=best[:, :-1])
@@ -157,38 +140,18 @@ def _sweep(
         np.subtract(best, best.min(axis=1, keepdims=True), out=here)
 
 
-def _modulated(
-    grey: np.ndarray, small: int, large: int, shift: int, edge_grey: float
-) -> np.ndarray:
-    """[lines, places, 1] uint16 P2 for the step to each place; on the first line any."""
-    steps = np.full(grey.shape, large, dtype=np.uint16)
-    places = grey.shape[1]
-    to = slice(max(0, shift), places + min(0, shift))
-    of = slice(max(0, -shift), places + min(0, -shift))
-    change = np.abs(grey[1:, to] - grey[:-1, of])
-    steps[1:, to] = np.maximum(small, np.rint(large / (1 + change / np.float32(edge_grey))))
-    return steps[..., None]
-
-
-A_FACTORS = {Fit.V: 0.03, Fit.PARABOLA: 0.57}
-"""What `linearised` needs for Hamming distances over blocks, without grey values: measured on
-synthetic dots over 16 phases (tests/sensors/matching/test_census.py)."""
-
-
-@dataclass(frozen=True)
+@settings
 class CensusMatcher:
     """Hamming distances of census strings, semi-global, checked both ways, with sub-pixels.
 
     The census string of a pixel says which pixels of the window around it are brighter than
     it, so gain and offset of the images do not matter. The parts are those that the public
     settings of RealSense D400 cameras name (librealsense, rs_advanced_mode_command.h): census
-    9 x 9 and absolute difference, scan-line optimisation with penalties that depend on the
-    image, second peak, left-right agreement, linearised sub-pixels.
+    9 x 9, scan-line optimisation, second peak, left-right agreement, linearised sub-pixels.
 
     The semi-global sums choose the whole disparity; sub-pixels come from the costs before that,
     because penalties between neighbours pull them to whole pixels. Measured on synthetic dots
-    at 16 phases, block 7: bias at most 0.015 px and an RMS of 0.03 to 0.06 px; from the path
-    sums the bias is 0.10 px (V) to 0.19 px (parabola).
+    at 16 phases, block 7: bias at most 0.015 px and an RMS of 0.03 to 0.06 px.
 
     Attributes:
         num_disparities: how many whole disparities are searched, 3..512.
@@ -196,59 +159,33 @@ class CensusMatcher:
         window_px: side of the census window, odd, 3..15.
         block_px: side of the block over which costs are summed, odd; 1 is none. It sets the
             noise: on the same dots the RMS is 0.24 px (1), 0.09 (5), 0.06 (7).
-        difference_weight: cost of one grey value of difference, in bits; 0 leaves them out.
-            They make no sense against a stored image of the pattern.
-        difference_cap: larger differences of grey values cost no more.
         small_step, large_step: P1 and P2 in bits.
         paths: 4 or 8; 0 chooses by block costs alone.
-        edge_grey: difference of grey values at which P2 is halved; 0 is off.
         uniqueness_percent: every other cost but the neighbours' is more than this above the
             best.
         max_difference_px: how far the whole disparities found from `image` and from `other` may
             be apart; -1 switches the check off.
         min_texture: standard deviation of the grey values that the census window needs.
         texture: what it needs relative to the camera's noise; null asks for nothing more.
-        fit: curve through three costs.
-        a_factor: see `linearised`; null is the measured one of the fit.
-        path_phase: take sub-pixels from the path sums, with the locking said above.
+        a_factor: see `linearised`.
     """
 
-    num_disparities: int = 64
+    num_disparities: Annotated[int, Interval(ge=3, le=512)] = 64
     min_disparity: int = 0
-    window_px: int = 9
-    block_px: int = 7
-    difference_weight: float = 0.0
-    difference_cap: int = 30
-    small_step: float = 6.0
-    large_step: float = 40.0
-    paths: int = 8
-    edge_grey: float = 0.0
-    uniqueness_percent: float = 5.0
+    window_px: Annotated[int, Interval(ge=3, le=15), IsOdd] = 9
+    block_px: Annotated[int, Ge(1), IsOdd] = 7
+    small_step: NotNegative = 6.0
+    large_step: NotNegative = 40.0
+    paths: Literal[0, 4, 8] = 8
+    uniqueness_percent: NotNegative = 5.0
     max_difference_px: int = 1
-    min_texture: float = 2.0
+    min_texture: NotNegative = 2.0
     texture: TextureOverNoise | None = None
-    fit: Fit = Fit.V
-    a_factor: float | None = None
-    path_phase: bool = False
+    a_factor: Annotated[float, Interval(ge=-1, le=1)] = 0.03
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "fit", Fit.of(self.fit))
-        check_ranges(self, num_disparities="[3, 512]", window_px="odd [3, 15]", block_px="odd >= 1")
-        if self.paths not in (0, 4, 8):
-            raise ConfigError(f"paths must be 0, 4 or 8, got {self.paths}")
-        if not 0 <= self.small_step <= self.large_step:
-            raise ConfigError(
-                "small_step and large_step must satisfy 0 <= small_step <= large_step, got "
-                f"{self.small_step} and {self.large_step}"
-            )
-        grey = ("difference_weight", "difference_cap", "edge_grey", "min_texture")
-        check_ranges(self, **dict.fromkeys(grey, ">= 0"))
-        check_ranges(self, uniqueness_percent=">= 0", a_factor="[-1, 1]")
-        if self._worst * self.block_px**2 > 65535:
-            raise ConfigError(
-                f"block_px {self.block_px} with costs up to {self._worst} a pixel exceeds 16 "
-                "bits: lower block_px, window_px or difference_weight"
-            )
+        assert self.small_step <= self.large_step, "small_step must not be above large_step"
+        assert self._worst * self.block_px**2 < 1 << 16, "costs of a block exceed 16 bits"
 
     @property
     def reach_px(self) -> int:
@@ -258,7 +195,7 @@ class CensusMatcher:
     @property
     def _worst(self) -> int:
         """Largest cost of a pixel; also that of places outside the other image."""
-        return self.window_px**2 - 1 + round(self.difference_weight * min(self.difference_cap, 255))
+        return self.window_px**2 - 1
 
     def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
         """Disparities; see `Matcher.match`."""
@@ -268,7 +205,7 @@ class CensusMatcher:
         most = self.min_disparity + count - 1
         begin = first - most
         cost = self._cost(image, other, begin)
-        total = self._aggregated(cost, image)
+        total = self._aggregated(cost)
 
         best = total.argmin(axis=2)
         row_of_costs = np.arange(height * width).reshape(height, width) * count
@@ -277,10 +214,8 @@ class CensusMatcher:
             place = np.clip(best + step, 0, count - 1)
             return volume.reshape(-1)[row_of_costs + place].astype(np.float32)
 
-        source = total if self.path_phase else cost
-        phase = offset(at(source, -1), at(source, 0), at(source, 1), self.fit)
-        a_factor = A_FACTORS[self.fit] if self.a_factor is None else self.a_factor
-        disparity = most - best - linearised(phase, a_factor)
+        phase = offset(at(cost, -1), at(cost, 0), at(cost, 1))
+        disparity = most - best - linearised(phase, self.a_factor)
 
         columns = begin + np.arange(width) + best
         within = (columns >= 1) & (columns < other.shape[1] - 1)
@@ -316,21 +251,12 @@ class CensusMatcher:
         length = width + count - 1
         words = census(image, self.window_px)
         others = [columns_of(word, begin, length) for word in census(other, self.window_px)]
-        grey = columns_of(other, begin, length)
-        if grey.dtype != np.uint8:
-            grey = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-        capped = np.minimum(np.arange(256), self.difference_cap)
-        difference = np.rint(self.difference_weight * capped).astype(np.uint16)
-
         cost = np.empty((height, width, count), dtype=np.uint16)
         for row in range(height):  # a row of all places fits a cache
             bits = np.zeros((width, count), dtype=np.uint8)
             for a, b in zip(words, others, strict=True):
                 bits += count_ones(a[row][:, None] ^ sliding_window_view(b[row], count))
             cost[row] = bits
-            if self.difference_weight:
-                a_grey, b_grey = image[row][:, None], sliding_window_view(grey[row], count)
-                cost[row] += difference[np.maximum(a_grey, b_grey) - np.minimum(a_grey, b_grey)]
         columns = np.arange(begin, begin + length)
         missing = sliding_window_view((columns < 0) | (columns >= other.shape[1]), count)
         if missing.any():
@@ -341,7 +267,7 @@ class CensusMatcher:
         border = cv2.BORDER_REFLECT_101
         return cv2.boxFilter(cost, cv2.CV_16U, size, normalize=False, borderType=border)
 
-    def _aggregated(self, cost: np.ndarray, image: np.ndarray) -> np.ndarray:
+    def _aggregated(self, cost: np.ndarray) -> np.ndarray:
         """[h, w, D] uint16 that choose the disparity; never `cost` itself."""
         if not self.paths:
             return cost.copy()
@@ -354,8 +280,6 @@ class CensusMatcher:
             round(self.small_step * area) >> drop,
             round(self.large_step * area) >> drop,
             self.paths,
-            image,
-            self.edge_grey,
         )
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Interval
 
-from qs3.config.checks import check_ranges
 from qs3.sensors.matching.base import Match, linearised
 from qs3.sensors.optics.visibility import Reason, first_reason
 from qs3.utils.jit import has_numba
+from qs3.utils.settings import IsOdd, settings
 
 
 def correlation(
@@ -80,7 +82,7 @@ def _winner_by_numpy(scores: np.ndarray) -> Winner:
     return Winner(place, top, lower, upper, others.max(axis=0))
 
 
-@dataclass(frozen=True)
+@settings
 class NormalisedCorrelation:
     """Normalised correlation over a square window, winner takes all.
 
@@ -99,18 +101,14 @@ class NormalisedCorrelation:
             synthetic dots at 16 phases. 0.18 takes it below 0.01 px there.
     """
 
-    window_px: int = 9
+    window_px: Annotated[int, Ge(3), IsOdd] = 9
     min_disparity: int = 0
-    num_disparities: int = 64
-    steps_per_px: int = 0
+    num_disparities: Annotated[int, Ge(3)] = 64
+    steps_per_px: Annotated[int, Ge(0)] = 0
     min_score: float = 0.35
     uniqueness: float = 0.04
     max_difference_px: int = -1
-    a_factor: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self, window_px="odd >= 3", num_disparities=">= 3")
-        check_ranges(self, steps_per_px=">= 0", a_factor="[-1, 1]")
+    a_factor: Annotated[float, Interval(ge=-1, le=1)] = 0.0
 
     @property
     def reach_px(self) -> int:
@@ -194,7 +192,7 @@ class NormalisedCorrelation:
         return scores
 
 
-@dataclass(frozen=True)
+@settings
 class ReferenceMatcher(NormalisedCorrelation):
     """One camera against a stored image of the pattern, as in Kinect v1.
 
@@ -203,4 +201,4 @@ class ReferenceMatcher(NormalisedCorrelation):
     """
 
     min_disparity: int = -24
-    steps_per_px: int = 8
+    steps_per_px: Annotated[int, Ge(0)] = 8

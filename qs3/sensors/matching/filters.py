@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Interval
 
-from qs3.config.checks import check_ranges
+from qs3.utils.settings import Count, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class Quantiser:
     """The device's step of disparity.
 
@@ -20,10 +20,7 @@ class Quantiser:
         steps_per_px: 8 is 1/8 px (Kinect v1), 32 is 1/32 px (RealSense D400); 0 is none.
     """
 
-    steps_per_px: int = 0
-
-    def __post_init__(self) -> None:
-        check_ranges(self, steps_per_px=">= 0")
+    steps_per_px: Annotated[int, Ge(0)] = 0
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """[h, w] float32, rounded to the nearest step; NaN stays."""
@@ -32,6 +29,7 @@ class Quantiser:
         return (np.rint(disparity * self.steps_per_px) / self.steps_per_px).astype(np.float32)
 
 
+@runtime_checkable
 class PostFilter(Protocol):
     """Changes or drops disparities.
 
@@ -43,7 +41,7 @@ class PostFilter(Protocol):
         """[h, w] float32 px with NaN -> the same, changed; dropped values are NaN."""
 
 
-@dataclass(frozen=True)
+@settings
 class SmallRegions:
     """Drop islands: connected regions of similar disparity with few pixels.
 
@@ -53,11 +51,8 @@ class SmallRegions:
     """
 
     keeps_steps: ClassVar[bool] = True
-    max_size_px: int = 50
-    max_step_px: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "SmallRegions.", max_size_px=">= 0", max_step_px="> 0")
+    max_size_px: Annotated[int, Ge(0)] = 50
+    max_step_px: Positive = 1.0
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""
@@ -72,58 +67,7 @@ class SmallRegions:
         return np.where(fixed == -32_768, np.float32(np.nan), disparity).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Median:
-    """Replace each value by the median of the valid ones in a window; holes stay holes.
-
-    Attributes:
-        size_px: side of the window, odd.
-    """
-
-    size_px: int = 3
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "Median.", size_px="odd >= 3")
-
-    def apply(self, disparity: np.ndarray) -> np.ndarray:
-        """See `PostFilter.apply`."""
-        stack = np.sort(_shifts(disparity, self.size_px), axis=0)  # NaN come last
-        count = np.isfinite(stack).sum(axis=0)
-        last = np.maximum(count - 1, 0)
-        low, high = (
-            np.take_along_axis(stack, place[None], axis=0)[0]
-            for place in (last // 2, -(-last // 2))
-        )
-        return np.where(np.isfinite(disparity), (low + high) / 2, np.nan).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class NeighbourCheck:
-    """Drop values that too few neighbours agree with.
-
-    Attributes:
-        size_px: side of the window, odd.
-        max_step_px: a neighbour agrees if it differs by at most this.
-        min_share: share of the window's other pixels that must agree; missing ones do not.
-    """
-
-    keeps_steps: ClassVar[bool] = True
-    size_px: int = 5
-    max_step_px: float = 1.0
-    min_share: float = 0.4
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "NeighbourCheck.", size_px="odd >= 3", min_share="[0, 1]")
-
-    def apply(self, disparity: np.ndarray) -> np.ndarray:
-        """See `PostFilter.apply`."""
-        near = np.abs(_shifts(disparity, self.size_px) - disparity) <= self.max_step_px
-        others = self.size_px**2 - 1
-        enough = near.sum(axis=0) - 1 >= self.min_share * others
-        return np.where(enough, disparity, np.float32(np.nan)).astype(np.float32)
-
-
-@dataclass(frozen=True)
+@settings
 class SpatialFilter:
     """Smooth along rows and columns, stopping at steps, as the RealSense SDK's spatial filter.
 
@@ -139,12 +83,9 @@ class SpatialFilter:
         iterations: how often all four directions are gone.
     """
 
-    alpha: float = 0.5
-    max_step_px: float = 1.0
-    iterations: int = 2
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "SpatialFilter.", alpha="(0, 1]", max_step_px="> 0", iterations=">= 1")
+    alpha: Annotated[float, Interval(gt=0, le=1)] = 0.5
+    max_step_px: Positive = 1.0
+    iterations: Count = 2
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""
@@ -164,45 +105,3 @@ class SpatialFilter:
             with np.errstate(invalid="ignore"):
                 near = np.abs(here - before) <= self.max_step_px  # false for NaN
             np.copyto(here, alpha * here + (1 - alpha) * before, where=near)
-
-
-@dataclass(frozen=True)
-class FillHoles:
-    """Fill small holes by the farther side's disparity, as many drivers do.
-
-    Attributes:
-        max_width_px: gaps of a row that are wider stay.
-    """
-
-    keeps_steps: ClassVar[bool] = True
-    max_width_px: int = 5
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "FillHoles.", max_width_px=">= 1")
-
-    def apply(self, disparity: np.ndarray) -> np.ndarray:
-        """See `PostFilter.apply`."""
-        height, width = disparity.shape
-        valid = np.isfinite(disparity)
-        columns = np.arange(width)
-        before = np.maximum.accumulate(np.where(valid, columns, -1), axis=1)
-        after = np.minimum.accumulate(np.where(valid, columns, width)[:, ::-1], axis=1)[:, ::-1]
-        fill = ~valid & (before >= 0) & (after < width) & (after - before - 1 <= self.max_width_px)
-        rows = np.arange(height)[:, None]
-        left = disparity[rows, np.maximum(before, 0)]
-        right = disparity[rows, np.minimum(after, width - 1)]
-        return np.where(fill, np.fmin(left, right), disparity).astype(np.float32)
-
-
-def _shifts(image: np.ndarray, size_px: int) -> np.ndarray:
-    """[size * size, h, w]: the image shifted to every place of the window, NaN from outside."""
-    half = size_px // 2
-    height, width = image.shape
-    padded = np.pad(image, half, constant_values=np.nan)
-    return np.stack(
-        [
-            padded[dy : dy + height, dx : dx + width]
-            for dy in range(size_px)
-            for dx in range(size_px)
-        ]
-    )

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Interval, MultipleOf
 
-from qs3.config.checks import check_choice, check_ranges
-from qs3.errors import ConfigError
-from qs3.sensors.matching.base import Match, check_search, linearised, opencv_disparity
+from qs3.sensors.matching.base import Match, linearised, opencv_disparity
 from qs3.sensors.optics.visibility import Reason
+from qs3.utils.settings import IsOdd, settings
+
+_Search = Annotated[int, Ge(16), MultipleOf(16)]
 
 STEREOBM_BIAS_PX = 7.5 / 256
 """OpenCV's StereoBM computes 1/256 px, adds 15 and shifts by 4 bits: it rounds up to the
 next 1/16 px, which is on average 7.5/256 px too much (modules/calib3d/src/stereobm.cpp)."""
 
 
-@dataclass(frozen=True)
+@settings
 class StereoBlockMatcher:
     """OpenCV's StereoBM: sum of absolute differences on x-Sobel images, 1/16 px.
 
@@ -32,17 +34,13 @@ class StereoBlockMatcher:
             px; -1 switches the check off, as in the paper's sensor.
     """
 
-    num_disparities: int = 160
-    block_size: int = 19
+    num_disparities: _Search = 160
+    block_size: Annotated[int, Interval(ge=5, le=255), IsOdd] = 19
     texture_threshold: int = 10
     uniqueness_ratio: int = 15
     remove_bias: bool = True
     min_disparity: int = 0
     max_difference_px: int = -1
-
-    def __post_init__(self) -> None:
-        check_search(self.num_disparities)
-        check_ranges(self, block_size="odd [5, 255]")
 
     @property
     def steps_per_px(self) -> int:
@@ -93,7 +91,7 @@ _MODES = {
 }
 
 
-@dataclass(frozen=True)
+@settings
 class SemiGlobalMatcher:
     """OpenCV's StereoSGBM: Birchfield-Tomasi costs, aggregated along paths, 1/16 px.
 
@@ -115,25 +113,21 @@ class SemiGlobalMatcher:
             depths crowd at whole disparities.
     """
 
-    num_disparities: int = 160
+    num_disparities: _Search = 160
     min_disparity: int = 0
-    block_size: int = 5
+    block_size: Annotated[int, Interval(ge=1, le=31), IsOdd] = 5
     p1: int | None = None
     p2: int | None = None
     pre_filter_cap: int = 31
     uniqueness_ratio: int = 10
     max_difference_px: int = 1
-    mode: str = "sgbm"
+    mode: Literal["sgbm", "hh", "3way", "hh4"] = "sgbm"
     remove_bias: bool = True
-    a_factor: float = SGBM_A_FACTOR
+    a_factor: Annotated[float, Interval(ge=-1, le=1)] = SGBM_A_FACTOR
 
     def __post_init__(self) -> None:
-        check_search(self.num_disparities)
-        check_ranges(self, block_size="odd [1, 31]", a_factor="[-1, 1]")
-        check_choice("mode", self.mode, tuple(_MODES))
         small, large = self.penalties
-        if not 0 < small < large:
-            raise ConfigError(f"penalties must satisfy 0 < p1 < p2, got {small} and {large}")
+        assert 0 < small < large, "penalties must satisfy 0 < p1 < p2"
 
     @property
     def penalties(self) -> tuple[int, int]:

@@ -18,17 +18,18 @@ N >= 4 (shot noise is proportional to I_n, and the sum of cos sin^2 over the ste
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
-from qs3.errors import ConfigError
+from qs3.utils.settings import Positive, settings
 
 _COLUMNS_A_PERIOD = 8
 
 
-@dataclass(frozen=True)
+@settings
 class FringeCode:
     """Which slides are thrown.
 
@@ -41,30 +42,17 @@ class FringeCode:
         along_rows: fringes change from row to row, not from column to column.
     """
 
-    periods: tuple[float, ...] = (1.0, 8.0, 64.0)
-    steps: int = 4
-    columns: int = 1024
-    rows: int = 768
+    periods: tuple[Positive, ...] = (1.0, 8.0, 64.0)
+    steps: Annotated[int, Ge(3)] = 4
+    columns: Annotated[int, Ge(2)] = 1024
+    rows: Annotated[int, Ge(2)] = 768
     along_rows: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "periods", tuple(map(float, self.periods)))
-        if self.steps < 3:
-            raise ConfigError(
-                f"code.steps must be at least 3: there are 3 unknowns, got {self.steps}"
-            )
-        if not self.periods or sorted(set(self.periods)) != list(self.periods):
-            raise ConfigError(f"code.periods must increase, got {list(self.periods)}")
-        if not 0 < self.periods[0] <= 1:
-            raise ConfigError(
-                f"code.periods must begin with at most 1 period, got {list(self.periods)}"
-            )
+        assert self.periods == tuple(sorted(set(self.periods))), "code.periods must increase"
+        assert self.periods[0] <= 1, "code.periods must begin with at most 1 period"
         length = self.rows if self.along_rows else self.columns
-        if min(self.rows, self.columns) < 2 or self.periods[-1] * _COLUMNS_A_PERIOD > length:
-            raise ConfigError(
-                f"{self.periods[-1]:g} periods on {length} px of the slide: a period needs at "
-                f"least {_COLUMNS_A_PERIOD} px"
-            )
+        assert self.periods[-1] * _COLUMNS_A_PERIOD <= length, "a period needs 8 px of the slide"
 
     @cached_property
     def slides(self) -> np.ndarray:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Interval
 
-from qs3.config.checks import check_bool, check_ranges
-from qs3.errors import ConfigError
 from qs3.sensors.renderers.base import Image
+from qs3.utils.settings import Count, NotNegative, Positive, Share, settings
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class GreyNoise:
         return np.maximum(mean, 0) / per_grey + (self.read_noise_e / per_grey) ** 2 + 1 / 12
 
 
-@dataclass(frozen=True)
+@settings
 class InfraredCamera:
     """A linear 8-bit sensor with automatic exposure.
 
@@ -62,36 +62,18 @@ class InfraredCamera:
         max_gain: by how much the amplifier makes up for what `max_exposure` lacks, at most.
     """
 
-    white_quantile: float = 0.98
-    white_level: float = 220.0
-    electrons_at_white: float = 10_000.0
-    read_noise_e: float = 30.0
-    speckle_contrast: float = 0.0
-    psf_px: float = 0.0
-    fixed_gain: float | None = None
-    speckle_grain_px: int = 1
+    white_quantile: Annotated[float, Interval(gt=0, le=1)] = 0.98
+    white_level: Annotated[float, Interval(gt=0, le=255)] = 220.0
+    electrons_at_white: Positive = 10_000.0
+    read_noise_e: NotNegative = 30.0
+    speckle_contrast: Share = 0.0
+    psf_px: Annotated[float, Interval(ge=0, le=10)] = 0.0
+    fixed_gain: Positive | None = None
+    speckle_grain_px: Count = 1
     ambient_speckles: bool = True
     metering: Literal["object", "image"] | None = None
-    max_exposure: float | None = None
-    max_gain: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            white_quantile="(0, 1]",
-            white_level="(0, 255]",
-            electrons_at_white="> 0",
-            read_noise_e=">= 0",
-            speckle_contrast="[0, 1]",
-            speckle_grain_px=">= 1",
-            psf_px="[0, 10]",
-            fixed_gain="> 0",
-            max_exposure="> 0",
-            max_gain=">= 1",
-        )
-        check_bool("ambient_speckles", self.ambient_speckles)
-        if self.metering not in (None, "object", "image"):
-            raise ConfigError(f"metering must be object, image or null, got {self.metering!r}")
+    max_exposure: Positive | None = None
+    max_gain: Annotated[float, Ge(1)] = 1.0
 
     @property
     def needs_ambient(self) -> bool:
@@ -190,7 +172,7 @@ def filmic(radiance: np.ndarray) -> np.ndarray:
     return np.interp(place, np.arange(len(_CURVE)), _CURVE)
 
 
-@dataclass(frozen=True)
+@settings
 class FilmicCamera:
     """A camera without noise whose picture is a tone-mapped 8-bit file, as released.
 
@@ -204,11 +186,8 @@ class FilmicCamera:
             less is only partly covered by the object; the background shows through the rest.
     """
 
-    background: float = 0.0
-    faintest: float = 0.216
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "infrared.", background=">= 0", faintest="> 0")
+    background: NotNegative = 0.0
+    faintest: Positive = 0.216
 
     def metered(self, image: Image, usual: str) -> np.ndarray:
         """The pixels [h, w] bool of the object; nothing depends on them."""

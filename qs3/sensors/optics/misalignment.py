@@ -1,18 +1,16 @@
-"""Smooth random fields over the pixels of an image: errors that neighbours share."""
+"""What a factory's calibration leaves: lens distortion, and rows and columns that do not meet."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from scipy.ndimage import map_coordinates
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics, Window
+from qs3.utils.settings import Positive, settings
 
 _WAVES = 64
 
@@ -38,7 +36,11 @@ def smooth_field(window: Window, cell_px: float, rng: np.random.Generator) -> np
 _STEPS = 8  # of the fixed point that undoes the distortion
 
 
-@dataclass(frozen=True)
+_Radial = Annotated[float, Interval(ge=-0.5, le=0.5)]
+_Shift = Annotated[float, Interval(ge=0, le=10)]
+
+
+@settings
 class Misalignment:
     """Errors that stay in a pair of rectified images, the same in each frame of a device.
 
@@ -55,31 +57,12 @@ class Misalignment:
         seed: of the fields: the device.
     """
 
-    k1: float = 0.0
-    k2: float = 0.0
-    rows_px: float = 0.0
-    columns_px: float = 0.0
-    cell_px: float = 300.0
+    k1: _Radial = 0.0
+    k2: _Radial = 0.0
+    rows_px: _Shift = 0.0
+    columns_px: _Shift = 0.0
+    cell_px: Positive = 300.0
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        shifts = dict.fromkeys(("rows_px", "columns_px"), "[0, 10]")
-        radial = dict.fromkeys(("k1", "k2"), "[-0.5, 0.5]")
-        check_ranges(self, "misalignment.", cell_px="> 0", **shifts, **radial)
-
-    @classmethod
-    def of(cls, settings: Mapping[str, Any]) -> Misalignment:
-        """From a config without a class.
-
-        Raises:
-            ConfigError: a key that there is not, or a value out of its range.
-        """
-        keys = [each.name for each in fields(cls)]
-        if unknown := [str(key) for key in settings if key not in keys]:
-            raise ConfigError(
-                f"sensor.misalignment.{unknown[0]} is unknown; there are {', '.join(keys)}"
-            )
-        return cls(**settings)
 
     @property
     def distorts(self) -> bool:

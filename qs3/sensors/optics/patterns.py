@@ -7,26 +7,17 @@ ours have the same statistics and are drawn from a seed, so that nothing vendor-
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Interval
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
-
-
-class Slide(Protocol):
-    """What a projector throws."""
-
-    @property
-    def slide(self) -> np.ndarray:
-        """[H, W] float32 in 0..1, row 0 at the top."""
+from qs3.utils.settings import Count, Share, settings
 
 
-@dataclass(frozen=True)
+@settings
 class Speckle:
     """A pseudo-random pattern of square dots that keep a distance from each other.
 
@@ -42,62 +33,22 @@ class Speckle:
             diffractive element have (Reichinger 2011, of Kinect v1).
     """
 
-    columns: int = 633
-    rows: int = 495
-    tiles: int = 1
-    dot_px: int = 2
-    fill: float = 0.111
-    spacing: int = 1
+    columns: Count = 633
+    rows: Count = 495
+    tiles: Count = 1
+    dot_px: Count = 2
+    fill: Annotated[float, Interval(gt=0, le=0.6)] = 0.111
+    spacing: Annotated[int, Ge(0)] = 1
     seed: int = 0
-    brightness_spread: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            "pattern.",
-            brightness_spread="[0, 1]",
-            spacing=">= 0",
-            **dict.fromkeys(("columns", "rows", "tiles", "dot_px"), ">= 1"),
-        )
-        densest = 1 / (1 + self.spacing) ** 2
-        if not 0 < self.fill <= 0.6 * densest:
-            raise ConfigError(
-                f"pattern.fill {self.fill} cannot be reached with spacing {self.spacing}: "
-                f"it must be in (0, {0.6 * densest:.3f}]"
-            )
-        places = self.rows * self.columns
-        if not self._wanted:
-            raise ConfigError(
-                f"pattern.fill {self.fill} lights none of the {places} positions of a tile: it "
-                f"must be above {0.5 / places:.2g}, or take more pattern.columns and rows"
-            )
-        if (self._wanted - 1) * (2 * self.spacing + 1) ** 2 >= places:
-            self._dots(self._rng())  # with fewer there is always room for one more
-
-    @property
-    def _wanted(self) -> int:
-        """Lit positions of a tile."""
-        return round(self.fill * self.rows * self.columns)
-
-    def _rng(self) -> np.random.Generator:
-        return np.random.default_rng([0x5BEC, self.seed])
-
-    def _dots(self, rng: np.random.Generator) -> np.ndarray:
-        """[rows, columns] bool of a tile; ConfigError if so many dots find no room."""
-        tile = _spaced_dots(self.rows, self.columns, self._wanted, self.spacing, rng)
-        if (placed := int(tile.sum())) < self._wanted:
-            raise ConfigError(
-                f"pattern.fill {self.fill} cannot be reached with spacing {self.spacing}: of "
-                f"{self._wanted} dots of a tile {placed} found room, so that it must be at most "
-                f"{placed / tile.size:.3g}"
-            )
-        return tile
+    brightness_spread: Share = 0.0
 
     @cached_property
     def slide(self) -> np.ndarray:
         """[rows * tiles * dot_px, columns * tiles * dot_px] float32, 0 dark or 1 lit."""
-        rng = self._rng()
-        tile = self._dots(rng)
+        rng = np.random.default_rng([0x5BEC, self.seed])
+        wanted = round(self.fill * self.rows * self.columns)
+        tile = _spaced_dots(self.rows, self.columns, wanted, self.spacing, rng)
+        assert 0 < tile.sum() == wanted, f"pattern.fill={self.fill}: {tile.sum()} dots of {wanted}"
         if self.brightness_spread:
             tile = tile * (1 - self.brightness_spread * rng.random(tile.shape))
         image = np.tile(tile, (self.tiles, self.tiles))
@@ -134,7 +85,7 @@ def _spaced_dots(
     return lit.reshape(rows, columns)
 
 
-@dataclass(frozen=True)
+@settings
 class ReleasedSlide(Speckle):
     """A speckle pattern with the shape of the released slide's dots.
 
@@ -149,19 +100,13 @@ class ReleasedSlide(Speckle):
         brightness_spread: 0, for the picture's dots are all white.
     """
 
-    columns: int = 211
-    rows: int = 165
-    tiles: int = 3
-    detail: int = 2
+    columns: Count = 211
+    rows: Count = 165
+    tiles: Count = 3
+    detail: Count = 2
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ranges(self, "pattern.", detail=">= 1")
-        if self.brightness_spread:
-            raise ConfigError(
-                "the released slide's dots are equally bright: leave pattern.brightness_spread at "
-                f"0, got {self.brightness_spread}, or take optics.patterns.Speckle as the pattern"
-            )
+        assert not self.brightness_spread, "the released slide's dots are equally bright"
 
     @cached_property
     def slide(self) -> np.ndarray:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import ctypes
 import sys
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
+from annotated_types import Ge
 
-from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.gloss import Gloss
+from qs3.utils.settings import Count, settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,6 @@ class Body:
     albedo: float = 0.8
     label: int = 1
     gloss: Gloss | None = None
-
-    def __post_init__(self) -> None:
-        check_ranges(self, albedo="[0, 1]", label="[0, 255]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +54,6 @@ class Projector:
     tan_half_width: float
     strength: float = 1.0
 
-    def __post_init__(self) -> None:
-        if self.slide.ndim != 2 or self.slide.dtype != np.float32:
-            raise ConfigError(
-                f"a slide is a float32 image [H, W], got {self.slide.dtype} {self.slide.shape}"
-            )
-        check_ranges(self, tan_half_width="> 0")
-
 
 @dataclass(frozen=True, eq=False)
 class AreaLight:
@@ -78,9 +68,6 @@ class AreaLight:
     world_from_light: np.ndarray
     side_m: float
     radiance: float
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "light.", side_m="> 0", radiance=">= 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +102,6 @@ class Scene:
     def clear(self) -> bool:
         """Whether light passes through any body."""
         return any(body.gloss is not None and body.gloss.transmission for body in self.bodies)
-
-    def __post_init__(self) -> None:
-        if not self.bodies:
-            raise ConfigError("a scene needs at least one body")
-        check_ranges(self, ambient=">= 0", bounces="[0, 1]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +176,7 @@ class Renderer(Protocol):
         """Renderer, variant and library versions: what decides the bytes it makes."""
 
 
-@dataclass(frozen=True)
+@settings
 class RendererSettings:
     """Settings both renderers share.
 
@@ -204,11 +186,8 @@ class RendererSettings:
         threads: 0 is all cores. Output must not depend on it.
     """
 
-    samples: int = 16
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "renderer.", samples=">= 1")
+    samples: Count = 16
+    threads: Annotated[int, Ge(0)] = 1
 
 
 def give_memory_back() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from qs3.errors import ConfigError, RenderError
+from qs3.errors import RenderError
 
 CHOICES = ("auto", "cpu", "gpu")
 _BACKENDS = ("OPTIX", "CUDA")  # OptiX needs a newer driver and is faster
@@ -33,11 +33,9 @@ def choose(wanted: str, listed: dict[str, list[str]]) -> Device:
     """The device for one of `CHOICES`; `listed` are names of GPUs by backend, see `list_gpus`.
 
     Raises:
-        ConfigError: `wanted` is none of them.
         RenderError: a GPU is wanted and none is listed.
     """
-    if wanted not in CHOICES:
-        raise ConfigError(f"renderer.device must be one of {', '.join(CHOICES)}, got {wanted!r}")
+    assert wanted in CHOICES, f"renderer.device must be one of {CHOICES}"
     if wanted == "cpu":
         return Device()
     for backend in _BACKENDS:
@@ -45,10 +43,7 @@ def choose(wanted: str, listed: dict[str, list[str]]) -> Device:
             # One is used: rendering on several splits the image, and worker processes share one.
             return Device(backend, listed[backend][0])
     if wanted == "gpu":
-        raise RenderError(
-            "renderer.device=gpu, but Blender lists no GPU for OptiX or CUDA: they need an NVIDIA "
-            "GPU and its driver. renderer.device=auto falls back to the CPU"
-        )
+        raise RenderError("renderer.device=gpu: Blender lists no NVIDIA GPU for OptiX or CUDA")
     return Device()
 
 

@@ -16,18 +16,19 @@ albedo) (1 - o . h)^5 (Schlick). Light is not passed on from facet to facet.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
-from qs3.config.checks import check_bool, check_ranges
+from qs3.utils.settings import Share, settings
 
 COSINES = 33
 """Entries of `kept_back`, at cosines 0 to 1."""
 _FACETS = 24  # squared: facets that a mean is taken over
 
 
-@dataclass(frozen=True)
+@settings
 class Gloss:
     """How a surface shines, beside its albedo; the defaults are those of Blender's Principled BSDF.
 
@@ -40,15 +41,10 @@ class Gloss:
             sheet; the rest meets the surface. Depth and label are the sheet's.
     """
 
-    roughness: float = 0.5
-    specular: float = 0.5
+    roughness: Annotated[float, Interval(ge=0.1, le=1)] = 0.5
+    specular: Share = 0.5
     metal: bool = False
-    transmission: float = 0.0
-
-    def __post_init__(self) -> None:
-        clear = "[0, 0.95]"
-        check_ranges(self, "gloss.", roughness="[0.1, 1]", specular="[0, 1]", transmission=clear)
-        check_bool("gloss.metal", self.metal)
+    transmission: Annotated[float, Interval(ge=0, le=0.95)] = 0.0
 
     @property
     def alpha(self) -> float:

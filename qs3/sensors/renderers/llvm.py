@@ -190,7 +190,8 @@ WIDTH = 8
 """How many rays the LLVM kernels take at once: the same with and without AVX-512.
 
 By itself Dr.Jit takes 16 where there is AVX-512 and 8 elsewhere. Embree resolves ties by it, of
-faces that lie in each other, as in many CAD meshes: some points in a hundred thousand change. Every processor that Mitsuba's wheels run on can do it; of 16 some would emulate half."""
+faces that lie in each other, as in many CAD meshes: some points in a hundred thousand change. Every
+processor that Mitsuba's wheels run on can do 8; of 16 some would emulate half."""
 
 # Of drjit 1.5's llvm.h, as its compiler names them.
 _GET_CPU, _GET_FEATURES = "_Z19jit_llvm_target_cpuv", "_Z24jit_llvm_target_featuresv"
