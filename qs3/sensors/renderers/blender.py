@@ -1,4 +1,8 @@
-"""Reading the EXR files that Blender writes here."""
+"""Blender's Cycles, on the CPU or a GPU: the renderer of the paper, our reference.
+
+The only place that imports bpy. One process holds one Blender with global state; every call
+builds its own data, renders, and removes it, so nothing is left for the next call.
+"""
 
 from __future__ import annotations
 
@@ -36,50 +40,11 @@ from qs3.sensors.renderers.blender_surfaces import (
     surface,
 )
 
-
-def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Channels [h, w] float32 by full name of an EXR file as Blender writes it here.
-
-    That is scan lines, float32, not compressed. Neither bpy nor OpenCV hands out the channels of a
-    multilayer file.
-    """
-    data = path.read_bytes()
-    if data[:4] != b"\x76\x2f\x31\x01":
-        raise RenderError(f"{path}: not an EXR file")
-    attributes: dict[str, bytes] = {}
-    at = 8
-    while data[at]:
-        name_end = data.index(0, at)
-        type_end = data.index(0, name_end + 1)
-        size = int.from_bytes(data[type_end + 1 : type_end + 5], "little")
-        start = type_end + 5
-        attributes[data[at:name_end].decode()] = data[start : start + size]
-        at = start + size
-    if attributes["compression"] != b"\0":
-        raise RenderError(f"{path}: the EXR file is compressed")
-    x0, y0, x1, y1 = np.frombuffer(attributes["dataWindow"], "<i4")
-    width, height = int(x1 - x0) + 1, int(y1 - y0) + 1
-
-    names, listing, spot = [], attributes["channels"], 0
-    while listing[spot]:
-        name_end = listing.index(0, spot)
-        if listing[name_end + 1 : name_end + 5] != b"\2\0\0\0":
-            raise RenderError(f"{path}: channels are not float32")
-        names.append(listing[spot:name_end].decode())
-        spot = name_end + 17  # type, linearity and sampling: 16 bytes
-    # A line: its number, its size, then all of channel 0, all of channel 1, ...
-    line = np.dtype([("y", "<i4"), ("size", "<i4"), ("value", "<f4", (len(names), width))])
-    first = at + 1 + 8 * height  # behind the table of line offsets
-    lines = np.frombuffer(data, line, count=height, offset=first)
-    return {name: lines["value"][:, i] for i, name in enumerate(names)}
-
-
 # How far behind a surface its shadow caster lies, relative to the distance from the projector:
 # 0.2 mm at 2 m, about the gap that Mitsuba leaves.
 _SHADOW_GAP = 1e-4
 _SHEETS = 32  # clear faces on the way from the camera and on to the light; Cycles' own limit is 8
 _BACKGROUND_M = 1e9  # Cycles writes 1e10 m where nothing is hit
-_PACKAGES = "libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libgl1 libegl1"
 
 
 class BlenderRenderer:
@@ -103,8 +68,7 @@ class BlenderRenderer:
             name: what the configuration calls it; taken so that its node can be instantiated.
 
         Raises:
-            RenderError: Blender is not installed, a library that it needs is missing, or a GPU
-                is wanted and none is there.
+            RenderError: Blender or a library that it needs is missing, or the GPU that is wanted.
         """
         self.settings = RendererSettings(samples, threads)
         with _one_cpu() if threads == 1 else nullcontext():
@@ -116,8 +80,6 @@ class BlenderRenderer:
         self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
     ) -> list[Image]:
         """Render every camera; see `Renderer.render`."""
-        if len(geometry) != len(cameras):
-            raise RenderError(f"{len(cameras)} cameras but {len(geometry)} geometry flags")
         with tempfile.TemporaryDirectory(prefix="qs3-blender-") as folder:
             said = Path(folder) / "blender.log"
             try:
@@ -205,7 +167,7 @@ class BlenderRenderer:
             path = folder / f"{index}.exr"
             target.render.filepath = str(path)
             self._bpy.ops.render.render(write_still=True)
-            images.append(_image(read_exr(path), camera))
+            images.append(_image(_read_exr(path), camera))
             path.unlink()
         return images
 
@@ -214,12 +176,9 @@ def _import_bpy() -> Any:
     try:
         import bpy
     except ImportError as error:
-        if error.name == "bpy":
-            raise RenderError(
-                "Blender is not installed: pip install 'bpy>=4.5,<4.6' (Python 3.11)"
-            ) from None
         raise RenderError(
-            f"Blender cannot be loaded: {error}. On Debian, apt install {_PACKAGES}"
+            f"Blender cannot be loaded ({error}): pip install 'bpy>=4.5,<4.6', and on Debian apt "
+            "install libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libgl1 libegl1"
         ) from error
     return bpy
 
@@ -392,9 +351,7 @@ def _image(channels: dict[str, np.ndarray], camera: Camera) -> Image:
     """Channels of the file to an image; passes that were not asked for are not there."""
     named = {name.split(".", 1)[1]: value for name, value in channels.items() if "." in name}
     radiance = np.ascontiguousarray(named["Combined.R"])
-    shape = (camera.rendered.height, camera.rendered.width)
-    if radiance.shape != shape:
-        raise RenderError(f"Blender rendered {radiance.shape} pixels instead of {shape}")
+    assert radiance.shape == (camera.rendered.height, camera.rendered.width)
     depth, label = named.get("Depth.Z"), named.get("IndexOB.X")
     if depth is None or label is None:
         return Image.without_geometry(radiance)
@@ -411,3 +368,36 @@ def _remove_everything(bpy: Any) -> None:
         blocks = getattr(bpy.data, kind)
         for block in list(blocks):
             blocks.remove(block, do_unlink=True)
+
+
+def _read_exr(path: Path) -> dict[str, np.ndarray]:
+    """Channels [h, w] float32 by full name of an EXR file as Blender writes it here.
+
+    That is scan lines, float32, not compressed. Neither bpy nor OpenCV hands out the channels of a
+    multilayer file.
+    """
+    data = path.read_bytes()
+    attributes: dict[str, bytes] = {}
+    at = 8
+    while data[at]:
+        name_end = data.index(0, at)
+        type_end = data.index(0, name_end + 1)
+        size = int.from_bytes(data[type_end + 1 : type_end + 5], "little")
+        start = type_end + 5
+        attributes[data[at:name_end].decode()] = data[start : start + size]
+        at = start + size
+    assert attributes["compression"] == b"\0"
+    x0, y0, x1, y1 = np.frombuffer(attributes["dataWindow"], "<i4")
+    width, height = int(x1 - x0) + 1, int(y1 - y0) + 1
+
+    names, listing, spot = [], attributes["channels"], 0
+    while listing[spot]:
+        name_end = listing.index(0, spot)
+        assert listing[name_end + 1 : name_end + 5] == b"\2\0\0\0", "channels are not float32"
+        names.append(listing[spot:name_end].decode())
+        spot = name_end + 17  # type, linearity and sampling: 16 bytes
+    # A line: its number, its size, then all of channel 0, all of channel 1, ...
+    line = np.dtype([("y", "<i4"), ("size", "<i4"), ("value", "<f4", (len(names), width))])
+    first = at + 1 + 8 * height  # behind the table of line offsets
+    lines = np.frombuffer(data, line, count=height, offset=first)
+    return {name: lines["value"][:, i] for i, name in enumerate(names)}

@@ -99,10 +99,7 @@ def find_variant(variant: str = "auto") -> Probe:
     if variant.startswith("cuda_"):
         reason = "no libcuda found" if not cuda_may_work() else try_variant(variant, None)
         if reason is not None:
-            raise RenderError(
-                f"renderer.variant={variant} cannot run here: {reason}. It needs an NVIDIA GPU "
-                "with driver 535 or newer; variant=auto falls back to the CPU"
-            )
+            raise RenderError(f"renderer.variant={variant} cannot run here: {reason}")
     return Probe(variant)
 
 
@@ -154,11 +151,9 @@ def _probe_llvm(variant: str) -> Probe:
         if reason is None:
             return Probe(variant, path)
         reasons.append(f"{path}: {reason}")
-    tried = "; ".join(reasons) if reasons else "no libLLVM found in the usual library folders"
     raise RenderError(
-        f"renderer.variant={variant} cannot run here ({tried}). Install a libLLVM that works, "
-        f"`apt install libllvm19` on Debian, or name one in {LIBRARY_VARIABLE}; "
-        "variant=auto falls back to scalar_rgb, which needs none but is 20 to 40x slower"
+        f"renderer.variant={variant} cannot run here ({'; '.join(reasons) or 'no libLLVM found'}): "
+        f"apt install libllvm19, or name a libLLVM in {LIBRARY_VARIABLE}"
     )
 
 

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qs3.errors import ConfigError
 from qs3.sensors.devices.fringe import FringeProjection
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.matching import CensusMatcher
 from qs3.sensors.optics.infrared import InfraredCamera
-from tests.sensors.scenery import box_of, middle, plane, scan, square
+from tests.sensors.scenery import box_of, plane, scan, square
 
 SPECKLED = InfraredCamera(speckle_contrast=0.2, psf_px=0.4)
 
@@ -31,26 +29,6 @@ def test_without_speckle_of_its_own_ambient_light_costs_less(kind, renderer):
     assert good[1] > 0.6, (good, error)
 
 
-def test_with_sunlight_speckle_on_the_projectors_light_only_costs_nothing(renderer):
-    """Ambient light 20 times a dot at 4 m; with speckle on all light the plane is lost in it."""
-    sensor = SpeckleStereo(ambient=20.0, matcher=CensusMatcher(num_disparities=160))
-    fill, rms = [], []
-    for contrast, speckles in ((0.0, True), (0.2, False), (0.2, True)):
-        camera = InfraredCamera(
-            speckle_contrast=contrast, psf_px=0.4, read_noise_e=10.0, ambient_speckles=speckles
-        )
-        frame = scan(replace(sensor, infrared=camera), [plane(2.0, 0.15, tilt_deg=20)], renderer)
-        inside = middle(frame.label == 1)
-        lens = sensor.focal_px * sensor.baseline_m
-        off = middle(lens / frame.depth_m - lens / frame.clean_m)[inside]
-        fill.append(np.isfinite(off).mean())
-        rms.append(np.sqrt(np.nanmean(off**2)))
-    without, split, whole = range(3)
-    assert fill[split] > fill[without] - 0.02, (fill, rms)
-    assert rms[split] < 1.5 * rms[without] + 0.02, (fill, rms)
-    assert fill[whole] < fill[without] - 0.1 or rms[whole] > 10 * rms[without], (fill, rms)
-
-
 def test_a_bright_wall_darkens_the_object_where_the_whole_image_is_metered(renderer):
     thing = replace(square(2.0, 0.1, albedo=0.08), label=1)
     wall = replace(square(2.5, 0.5, albedo=0.8), label=0)
@@ -65,11 +43,6 @@ def test_a_bright_wall_darkens_the_object_where_the_whole_image_is_metered(rende
     brighter = 0.8 * (0.15 + 16 / 2.5**2) / (0.08 * (0.15 + 16 / 2.0**2))
     assert grey["object"] / grey["image"] == pytest.approx(brighter, rel=0.1)
     assert grey[None] == grey["object"]
-
-
-def test_fringes_refuse_it():
-    with pytest.raises(ConfigError, match=r"sensor\.infrared\.ambient_speckles=false"):
-        FringeProjection(infrared=replace(SPECKLED, ambient_speckles=False))
 
 
 @pytest.mark.parametrize("kind", [ReferenceSpeckle, FringeProjection])

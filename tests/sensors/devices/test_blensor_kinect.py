@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.blensor_kinect import DotMask, spread
-from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.optics.misalignment import smooth_field
-from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.optics.visibility import Reason
 from tests.sensors.scenery import middle, rectangle, scan, square
 
@@ -28,7 +26,6 @@ def test_a_plane_has_the_depth_of_its_rounded_disparity(renderer, depth):
     valid = np.isfinite(measured)
     assert valid.mean() > 0.95
     np.testing.assert_allclose(measured[valid], expected, rtol=1e-5)
-    assert abs(expected - depth) <= EXACT.depth_step_m(depth)
 
 
 def test_noise_is_as_large_as_stated_and_values_are_eighths(renderer):
@@ -128,16 +125,6 @@ def test_what_is_much_thinner_than_the_window_is_lost(renderer):
     assert share(30) > 0.9
 
 
-def test_every_step_th_pixel_of_one_image(renderer):
-    whole = scan(KINECT, [square(1.5)], renderer)
-    sparse = scan(replace(KINECT, step_px=4), [square(1.5)], renderer)
-    assert (sparse.left % 4, sparse.top % 4) == (2, 2)
-    rows = slice(sparse.top - whole.top, None, 4)
-    cols = slice(sparse.left - whole.left, None, 4)
-    for name in ("depth_m", "clean_m", "label", "cosine", "reason"):
-        np.testing.assert_array_equal(getattr(sparse, name), getattr(whole, name)[rows, cols])
-
-
 def test_reasons(renderer):
     frame = scan(KINECT, [square(1.5)], renderer)
     assert set(np.unique(frame.reason)) <= {Reason.OK, Reason.EMPTY, Reason.UNMATCHED}
@@ -155,8 +142,3 @@ def test_the_field_is_smooth_of_unit_size_and_knows_no_window():
     # No wave is shorter than 32 px: the slope's variance is (2 pi / 32)^2 / 4 along each axis.
     slope = np.gradient(fields, axis=2)[:, :, 1:-1]
     assert slope.std() == pytest.approx(np.pi / 32, rel=0.1)
-
-
-def test_without_a_quantiser_there_is_no_step():
-    assert DotMask(quantiser=Quantiser(0)).depth_step_m(2.0) == 0
-    assert DotMask(pattern=Speckle(dot_px=1)).depth_step_m(2.0) == pytest.approx(4 / (8 * 43.5))

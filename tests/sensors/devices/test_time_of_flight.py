@@ -113,24 +113,6 @@ def test_of_very_many_periods_those_in_range_are_tried():
     assert found == pytest.approx(9.0)
 
 
-def test_a_limited_search_finds_what_the_whole_one_does():
-    frequencies, rng = (100e6, 33.3e6), np.random.default_rng(0)  # 1000 periods
-    true = np.linspace(0.3, 7.5, 200)[None]
-    f = np.array(frequencies)[:, None, None]
-    noise = 2e-4 * rng.standard_normal((2, 1, 200))
-    phase = (4 * np.pi * f * true / SPEED_OF_LIGHT + noise) % (2 * np.pi)
-    amplitude = np.ones_like(phase)
-    whole, limited = (unwrapped(phase, amplitude, frequencies, far) for far in (np.inf, 8.0))
-    np.testing.assert_array_equal(limited, whole)
-    assert np.abs(limited[0] - true).max() < 0.01
-
-
-def test_a_camera_of_frequencies_without_a_large_divisor_measures(renderer):
-    camera = replace(QUIET, frequencies_hz=(100e6, 17_345_678.0))
-    frame = scan(camera, [square(2.0, 0.6)], renderer)
-    np.testing.assert_allclose(middle(frame.depth_m), 2.0, atol=1e-3)
-
-
 def edge_scene(camera, near, far, share_of_pixel):
     """A near rectangle that ends inside pixels of one column, before a far one."""
     column = 170
@@ -192,15 +174,6 @@ def test_blensors_noise_is_one_normal_law_along_the_ray(renderer):
         error = middle((frame.depth_m - depth) * rays(frame))
         assert error.mean() == pytest.approx(0.01, abs=3e-4)
         assert error.std() == pytest.approx(0.004, rel=0.05)
-
-
-def test_blensors_backfolding_and_reach(renderer):
-    exact = GaussianTimeOfFlight(noise_sigma_m=0.0, backfolding=True)
-    frame = scan(exact, [square(6.0, 1.0)], renderer)
-    length = middle(rays(frame))
-    np.testing.assert_allclose(middle(frame.depth_m) * length, 6.0 * length - 5.0, atol=1e-4)
-    near = replace(exact, max_distance_m=4.0)
-    assert (middle(scan(near, [square(6.0, 1.0)], renderer).reason) == Reason.RANGE).all()
 
 
 @given(st.integers(0, 50), st.integers(1, 50), st.integers(1, 7))

@@ -19,7 +19,7 @@ from qs3.sensors.matching import (
     SemiGlobalMatcher,
     StereoBlockMatcher,
 )
-from qs3.sensors.matching.filters import NeighbourCheck, Quantiser, SmallRegions, SpatialFilter
+from qs3.sensors.matching.filters import Quantiser, SmallRegions, SpatialFilter
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.sensors.scenery import middle, scan, square
 
@@ -52,6 +52,7 @@ def depth_errors(sensor, renderer, depths, half_m):
         yield scale / measured[np.isfinite(measured)] - scale / depth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STEREO)
 def test_planes_of_a_stereo_sensor_come_back(renderer, name):
     sensor = SpeckleStereo(
@@ -63,7 +64,9 @@ def test_planes_of_a_stereo_sensor_come_back(renderer, name):
     assert np.quantile(np.abs(pooled), 0.68) < (0.13 if name == "semi-global" else 0.1)
 
 
-@pytest.mark.parametrize("name", KINECT)
+@pytest.mark.parametrize(
+    "name", ["reference", "correlation", pytest.param("census", marks=pytest.mark.slow)]
+)
 def test_planes_of_a_sensor_with_a_stored_pattern_come_back(renderer, name):
     sensor = ReferenceSpeckle(matcher=KINECT[name])
     pooled = np.concatenate(list(depth_errors(sensor, renderer, np.linspace(1.95, 2.05, 8), 0.2)))
@@ -79,7 +82,7 @@ STEPS = [
     (ReferenceSpeckle(matcher=NormalisedCorrelation(9, -24, 64), quantiser=Quantiser(32)), 32),
     (SpeckleStereo(), 16),
     (SpeckleStereo(quantiser=Quantiser(32)), 16),
-    (SpeckleStereo(quantiser=Quantiser(32), filters=(SmallRegions(0), NeighbourCheck(3))), 16),
+    (SpeckleStereo(quantiser=Quantiser(32), filters=(SmallRegions(0),)), 16),
     (SpeckleStereo(quantiser=Quantiser(32), filters=(SpatialFilter(max_step_px=99),)), 32),
     (SpeckleStereo(filters=(SpatialFilter(max_step_px=99),)), 0),
     (SpeckleStereo(matcher=SemiGlobalMatcher(remove_bias=False)), 16),
@@ -101,11 +104,8 @@ def test_the_steps_that_are_stated_are_those_of_the_disparity(sensor, steps):
     assert sensor.steps_per_px == steps
     if steps:
         np.testing.assert_allclose(gaps, 1 / steps, atol=1e-4)
-        expected = 4 / (steps * sensor.focal_px * sensor.baseline_m)
-        assert sensor.depth_step_m(2.0) == pytest.approx(expected)
     else:
         assert gaps.max() < 0.02
-        assert sensor.depth_step_m(2.0) == 0
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "sensor/matcher").iterdir()))

@@ -4,43 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from qs3.sensors.matching.scores import correlation, winner
 
 from qs3.sensors.matching import NormalisedCorrelation, ReferenceMatcher
 from qs3.sensors.matching import correlation as scores
+from qs3.sensors.matching.correlation import correlation, winner
 from tests.sensors.matching.textures import dots, seen
 
 FIELDS = ("place", "top", "lower", "upper", "second")
-
-
-@pytest.fixture(params=["compiled", "numpy"])
-def way(request, monkeypatch):
-    if request.param == "numpy":
-        monkeypatch.setattr(scores, "has_numba", lambda: False)
-    return request.param
-
-
-@pytest.mark.parametrize("count", [3, 4, 5, 6, 7, 64])
-def test_the_winner_is_that_of_a_plain_search(way, count):
-    """Few different scores: many are equal, and many lie at an end of the search."""
-    rng = np.random.default_rng(count)
-    given_scores = rng.integers(-4, 5, (count, 6, 37)).astype(np.float32) / 4
-    kept = given_scores.copy()
-    found = winner(given_scores)
-    np.testing.assert_array_equal(given_scores, kept)
-    for row in range(6):
-        for col in range(37):
-            column = kept[:, row, col].tolist()
-            place = column.index(max(column))
-            far = [score for k, score in enumerate(column) if abs(k - place) > 2]
-            expected = (
-                place,
-                column[place],
-                column[max(place - 1, 0)],
-                column[min(place + 1, count - 1)],
-                max([-1.0, *far]),
-            )
-            assert tuple(getattr(found, name)[row, col] for name in FIELDS) == expected
 
 
 @given(st.integers(3, 70), st.integers(1, 5), st.integers(1, 70), st.integers(0, 2**32 - 1))

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from qs3.errors import ConfigError
 from qs3.sensors.optics.infrared import InfraredCamera
 
 
@@ -22,12 +21,6 @@ def test_noise_has_the_variance_of_shot_and_read_noise():
     expected = (electrons + 25.0**2) / per_grey**2 + 1 / 12
     assert grey.mean() == pytest.approx(128.0, abs=0.1)
     assert grey.var() == pytest.approx(expected, rel=0.02)
-
-
-def test_an_empty_region_gives_a_dark_image_not_an_error():
-    camera = InfraredCamera()
-    radiance = np.ones((4, 4), np.float32)
-    assert camera.gain(radiance, np.zeros((4, 4), bool)) == 0.0
 
 
 def test_laser_speckle_has_the_contrast_it_says_and_grows_with_the_signal():
@@ -62,13 +55,6 @@ def test_the_lens_spreads_a_point_as_a_gaussian():
     place = np.arange(31) - 15
     assert grey.sum() == pytest.approx(2000.0, rel=0.02)
     assert (grey * place**2).sum() / grey.sum() == pytest.approx(1.5**2, rel=0.06)
-
-
-def test_a_fixed_gain_does_not_look_at_the_image_and_saturates():
-    camera = InfraredCamera(fixed_gain=100.0, read_noise_e=0.0, electrons_at_white=1e9)
-    bright = np.full((4, 4), 9.0, np.float32)
-    assert camera.gain(bright, np.ones((4, 4), bool)) == 100.0
-    assert (camera.expose(bright, 100.0, np.random.default_rng(0)) == 255).all()
 
 
 def test_what_is_off_draws_nothing():
@@ -124,19 +110,3 @@ def test_exposure_comes_first_and_then_an_amplifier_which_amplifies_noise(
     per_grey = 2000.0 / 255.0 / amplified  # fewer electrons give a grey value
     expected = (grey * per_grey + 25.0**2) / per_grey**2 + 1 / 12
     assert seen.var() == pytest.approx(expected, rel=0.02)
-
-
-def test_limits_that_are_not_reached_change_no_byte():
-    radiance = np.random.default_rng(1).random((40, 40)).astype(np.float32)
-    plain, limited = InfraredCamera(), InfraredCamera(max_exposure=1000.0, max_gain=8.0)
-    everywhere = np.ones_like(radiance, dtype=bool)
-    assert plain.gain(radiance, everywhere) == limited.gain(radiance, everywhere)
-    pictures = [one.expose(radiance, 200.0, np.random.default_rng(2)) for one in (plain, limited)]
-    np.testing.assert_array_equal(*pictures)
-
-
-def test_settings_of_the_exposure_are_checked():
-    with pytest.raises(ConfigError, match="metering must be object, image or null"):
-        InfraredCamera(metering="centre")
-    with pytest.raises(ConfigError, match="max_gain"):
-        InfraredCamera(max_gain=0.5)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics, Window
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.optics.misalignment import Misalignment
@@ -23,12 +22,6 @@ def ramps():
 
 def shifts(lens, right):
     return [middle(lens.seen(ramp, WHOLE, K, right=right) - ramp) for ramp in ramps()]
-
-
-def test_without_errors_the_picture_is_the_same_object():
-    image = ramps()[0]
-    assert Misalignment().seen(image, WHOLE, K, right=True) is image
-    assert Misalignment().reach_px(K) == 0
 
 
 def test_fields_shift_the_right_picture_alone_by_their_rms():
@@ -82,17 +75,3 @@ def test_columns_that_do_not_meet_are_a_bias_of_the_depth(renderer):
     assert abs(moved) > 0.3
     # Where the right picture shows what lies farther right, its disparity is larger.
     assert error[1] - error[0] == pytest.approx(moved, abs=0.1)
-
-
-@pytest.mark.parametrize("word", ["rows_px", "k1", "cell_px"])
-def test_settings_are_checked(word):
-    with pytest.raises(ConfigError, match=f"misalignment.{word}"):
-        Misalignment(**{word: -1.0})
-
-
-def test_a_preset_without_it_takes_single_settings():
-    assert SpeckleStereo(misalignment={"rows_px": 0.2}).misalignment == Misalignment(rows_px=0.2)
-    with pytest.raises(ConfigError, match=r"misalignment\.row_px is unknown; there are k1"):
-        SpeckleStereo(misalignment={"row_px": 0.2})
-    with pytest.raises(ConfigError, match=r"misalignment\.k1"):
-        SpeckleStereo(misalignment={"k1": 3.0})

@@ -31,14 +31,6 @@ def test_dots_keep_their_distance_across_the_seams_of_tiles(columns, rows, spaci
                 assert not (tile & np.roll(tile, (dy, dx), axis=(0, 1))).any()
 
 
-def test_a_tile_repeats_and_a_seed_decides():
-    slide = Speckle(20, 16, tiles=3, dot_px=2, seed=4).slide
-    assert slide.shape == (96, 120)
-    np.testing.assert_array_equal(slide[:32, :40], slide[32:64, 80:120])
-    np.testing.assert_array_equal(slide, Speckle(20, 16, tiles=3, dot_px=2, seed=4).slide)
-    assert (slide != Speckle(20, 16, tiles=3, dot_px=2, seed=5).slide).any()
-
-
 def test_dots_of_different_brightness_stand_where_the_equal_ones_do():
     plain, varied = (
         Speckle(40, 30, seed=2).slide,

@@ -50,7 +50,7 @@ def has_avx512() -> bool:
 def test_whatever_the_processor_would_take(renderer, monkeypatch, width):
     before = rendered(renderer)
     with monkeypatch.context() as patched:
-        patched.setattr(llvm_width, "WIDTH", width)
+        patched.setattr(llvm, "WIDTH", width)
         other = rendered(renderer)
         assert llvm.fix_width() == width
     after = rendered(renderer)
@@ -63,7 +63,7 @@ def test_whatever_the_processor_would_take(renderer, monkeypatch, width):
 
 def test_where_drjit_cannot_be_asked_the_dataset_says_so(renderer, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr(llvm_width, "_library", lambda: None)
+        patched.setattr(llvm, "_library", lambda: None)
         rendered(renderer)
         assert renderer.provenance()["width"] == "unknown"
     rendered(renderer)
