@@ -25,7 +25,7 @@ from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
 from qs3.report.datasets import distance_to_mesh
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.optics.visibility import Reason
 from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, value_image
 from qs3.utils.seeding import object_rng
 

@@ -360,13 +360,11 @@ def correlations(
     lowest: int,
     highest: int,
     block_px: int,
-    grid: tuple[int, int, int] = (0, 0, 1),
 ) -> torch.Tensor:
     """[D, h, w] normalised correlation of blocks, -1..1, in steps of 1 / `STEPS` px.
 
-    Of the pixels of a grid: first row, first column, and step. Column u of `left` is column
-    u + offset - d of `right`; what is outside is dark, and between two pixels is the cubic through
-    four (Catmull and Rom).
+    Column u of `left` is column u + offset - d of `right`; what is outside is dark, and between two
+    pixels is the cubic through four (Catmull and Rom).
     """
     width = left.shape[1]
     begin = offset - highest - 1  # a pixel more on both sides for the cubics
@@ -378,8 +376,7 @@ def correlations(
 
     def mean(image: torch.Tensor) -> torch.Tensor:
         padded = F.pad(image[None], (half, half, half, half), mode="reflect")
-        row, column, step = grid
-        return F.avg_pool2d(padded[:, row:, column:], block_px, stride=step)[0]
+        return F.avg_pool2d(padded, block_px, stride=1)[0]
 
     mean_left = mean(left)
     spread_left = mean(left * left) - mean_left**2

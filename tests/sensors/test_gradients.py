@@ -10,11 +10,9 @@ import torch
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.gradients import (
     Twin,
-    blurred,
     correlations,
     pair_of,
     settings_of,
-    soft_argmax,
 )
 from qs3.sensors.matching import StereoBlockMatcher
 from qs3.sensors.optics.infrared import InfraredCamera
@@ -162,13 +160,6 @@ def test_the_variance_of_speckle_grows_with_the_square_of_its_contrast(pair):
     assert float(contrast.grad) == pytest.approx(2 * 0.3, rel=0.01)
 
 
-def test_the_lens_is_opencv_s_gaussian():
-    image = np.random.default_rng(0).random((40, 50))
-    ours = blurred(torch.from_numpy(image), torch.tensor(1.3, dtype=torch.float64)).numpy()
-    theirs = cv2.GaussianBlur(image, (13, 13), 1.3)
-    np.testing.assert_allclose(ours[8:-8, 8:-8], theirs[8:-8, 8:-8], atol=1e-4)
-
-
 @pytest.mark.parametrize("offset", [0, 7, -5])
 def test_correlation_at_whole_disparities_is_that_of_the_blocks(offset):
     rng = np.random.default_rng(offset + 10)
@@ -183,11 +174,3 @@ def test_correlation_at_whole_disparities_is_that_of_the_blocks(offset):
             parts.append(right[row - 2 : row + 3, at - 2 : at + 3])
             expected = np.corrcoef(*(part.ravel() for part in parts))[0, 1]
             assert float(found[4 * (d - low), row, column]) == pytest.approx(expected, abs=1e-4)
-
-
-def test_a_soft_argmax_finds_the_top_of_a_parabola():
-    place = torch.arange(17, dtype=torch.float64)
-    for top in (6.0, 7.3, 8.5):
-        score = 1 - 0.01 * (place - top) ** 2
-        found = soft_argmax(score[:, None, None], 80.0)
-        assert float(found) == pytest.approx(top, abs=0.05)

@@ -2,12 +2,10 @@
 
 The camera's ray through u meets the plane of light that leaves the projector at x / z = x_p. The
 projector looks the same way at a distance b from the camera, so x_p = x - b / Z with
-x = (u - cx) / f, and Z = f b / d with the disparity d = f (x - x_p). Above the camera the same
-holds for rows. The place on the slide comes from phase shifting (`optics.fringe_code`), so
+x = (u - cx) / f, and Z = f b / d with the disparity d = f (x - x_p). The place on the
+slide comes from phase shifting (`optics.fringe_code`), so
 
-    sigma_Z = Z^2 / b * 2 tan_half * sigma_s
-
-where tan_half is half the slide's extent along the fringes' change, at distance 1.
+    sigma_Z = Z^2 / b * 2 tan_half_width * sigma_s
 
 A view costs one render and one exposure a slide, and one render to know where the renderer's
 samples lie in their pixels: 13 with the defaults, where a speckle sensor needs one or two. The
@@ -33,11 +31,9 @@ from qs3.utils.settings import NotNegative, Positive, settings
 
 @settings
 class FringeProjection(TriangulatingSensor):
-    """A camera and a projector of fringes to the right of it or above. All numbers are ours.
+    """A camera and a projector of fringes to the right of it. All numbers are ours.
 
     Attributes:
-        baseline_m: the projector is above the camera, and not to its right, if the fringes change
-            along the rows (code.along_rows).
         tan_half_width: half the width of the slide at distance 1.
         projector_strength, ambient: as in SpeckleStereo.
         code: the slides.
@@ -67,18 +63,6 @@ class FringeProjection(TriangulatingSensor):
         """A pixel."""
         return 1
 
-    @property
-    def _offset_m(self) -> tuple[float, float]:
-        """Projector minus camera: to the right and down."""
-        return (0.0, -self.baseline_m) if self.code.along_rows else (self.baseline_m, 0.0)
-
-    @property
-    def _tan_half(self) -> float:
-        """Half the slide's extent along the change of the fringes, at distance 1."""
-        if self.code.along_rows:
-            return self.tan_half_width * self.code.rows / self.code.columns
-        return self.tan_half_width
-
     def depth_sigma_m(
         self, depth_m: float, noise: float | np.ndarray, modulation: float | np.ndarray
     ) -> float | np.ndarray:
@@ -88,16 +72,16 @@ class FringeProjection(TriangulatingSensor):
         `modulation` that of the finest fringes in grey values.
         """
         place = self.code.place_sigma(noise, modulation)
-        return depth_m**2 / self.baseline_m * 2 * self._tan_half * place
+        return depth_m**2 / self.baseline_m * 2 * self.tan_half_width * place
 
     def take(self, shot: Shot) -> DepthFrame:
         """See `DepthSensor.take`.
 
         The image "left" is the first exposure of the finest fringes, "exposures" has all.
         """
-        pose, seed = shot.pose_at(*self._offset_m), shot.seed()
+        pose, seed = shot.pose_at(self.baseline_m), shot.seed()
         images = self._render(shot, pose, seed)
-        centres = sample_centres(shot.camera, shot.renderer, seed, along_rows=self.code.along_rows)
+        centres = sample_centres(shot.camera, shot.renderer, seed)
         seen = images[0]
         hit = np.isfinite(seen.depth_m)
         radiance = np.stack([image.radiance for image in images])
@@ -136,24 +120,20 @@ class FringeProjection(TriangulatingSensor):
 
     def _off_slide(self, shot: Shot, depth_m: np.ndarray) -> np.ndarray:
         """[h, w] bool: the projector's slide ends before the surface; False where none is."""
-        right, down = self._offset_m
         x, y = tangents(shot.camera)
-        x, y = x - right / depth_m, y - down / depth_m
+        x = x - self.baseline_m / depth_m
         tan_half_height = self.tan_half_width * self.code.rows / self.code.columns
         return (np.abs(x) > self.tan_half_width) | (np.abs(y) > tan_half_height)
 
     def _match(self, exposures: np.ndarray, centres: np.ndarray) -> tuple[Match, np.ndarray]:
         """Disparity of [F, N, h, w] uint8 exposures, and [h, w] modulation of the finest.
 
-        `centres` [h, w] are the columns (or rows) in px that were really looked at.
+        `centres` [h, w] are the columns in px that were really looked at.
         """
         place, modulation, misfit = self.code.decode(exposures.astype(np.float64))
         k = self.intrinsics
-        on_slide = self._tan_half * (2 * place - 1)  # x / z (or y / z) in the projector
-        if self.code.along_rows:
-            disparity = k.focal_px * on_slide - (centres - k.cy_px)
-        else:
-            disparity = (centres - k.cx_px) - k.focal_px * on_slide
+        on_slide = self.tan_half_width * (2 * place - 1)  # x / z in the projector
+        disparity = (centres - k.cx_px) - k.focal_px * on_slide
         causes = {
             Reason.DARK: modulation.min(axis=0) < self.min_modulation,
             Reason.SATURATED: exposures.max(axis=(0, 1)) == 255,

@@ -85,7 +85,7 @@ class SpeckleStereo(TriangulatingSensor):
     @property
     def margin_px(self) -> int:
         """Fattening puts values up to half a block outside the silhouette; misalignment more."""
-        return self.matcher.reach_px + self.misalignment.reach_px(self.intrinsics)
+        return self.matcher.reach_px + self.misalignment.reach_px
 
     def take(self, shot: Shot) -> DepthFrame | None:
         """See `DepthSensor.take`."""
@@ -136,9 +136,8 @@ class SpeckleStereo(TriangulatingSensor):
         self, images: Sequence[Image], windows: Sequence[Window], canvas: Window
     ) -> list[np.ndarray]:
         """The radiance [h, w] of the left and the right image on the canvas, through the lenses."""
-        placed = [_place(*seen, canvas) for seen in zip(images, windows, strict=True)]
-        lens, k = self.misalignment, self.intrinsics
-        return [lens.seen(one, canvas, k, right=i == 1) for i, one in enumerate(placed)]
+        left, right = (_place(*seen, canvas) for seen in zip(images, windows, strict=True))
+        return [left, self.misalignment.seen(right, canvas, self.intrinsics)]
 
     def _match(self, left: np.ndarray, right: np.ndarray, first_column: int, gain: float) -> Match:
         """What the matcher finds; `first_column` is the canvas's first in the whole image."""

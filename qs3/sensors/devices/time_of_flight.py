@@ -43,8 +43,6 @@ from qs3.utils.settings import Count, IsOdd, NotNegative, Positive, settings
 
 SPEED_OF_LIGHT = 299_792_458.0
 """Metres a second."""
-_ALL_TURNS = 64
-"""Up to so many periods all are tried, so that what lies out of range is seen to."""
 
 
 @settings
@@ -59,8 +57,7 @@ class TimeOfFlight(DepthSensor):
     Attributes:
         lamp_offset_m: lamp minus camera along the camera's x. The device knows it.
         frequencies_hz: one, or more that are measured in turn; the first is unwrapped by the
-            others, and each counts by its noise. Beyond `max_depth_m` no period is looked for
-            where they repeat only after more than 64; see `unwrapped`.
+            others, and each counts by its noise. They need a large common divisor; see `unwrapped`.
         contrast: demodulation contrast C at all frequencies.
         electrons_at_1m: K for the lamp: electrons a bucket of white at 1 m, the sum over a
             frame's sub-exposures.
@@ -93,6 +90,8 @@ class TimeOfFlight(DepthSensor):
 
     def __post_init__(self) -> None:
         assert self.min_depth_m < self.max_depth_m, "min_depth_m must be below max_depth_m"
+        common = math.gcd(*(round(f) for f in self.frequencies_hz))
+        assert self.frequencies_hz[0] <= 64 * common, "frequencies_hz without a common divisor"
 
     @property
     def margin_px(self) -> int:
@@ -110,13 +109,6 @@ class TimeOfFlight(DepthSensor):
         noise = np.sqrt(mean_e + self.read_noise_e**2) / (math.sqrt(2) * amplitude_e)
         return SPEED_OF_LIGHT / (4 * math.pi * together) * noise
 
-    @property
-    def _farthest_m(self) -> float:
-        """Half the longest path to a surface at `max_depth_m` that a pixel can see."""
-        k = self.intrinsics
-        corner = math.sqrt(k.cx_px**2 + k.cy_px**2 + k.focal_px**2) / k.focal_px
-        return self.max_depth_m * corner + abs(self.lamp_offset_m) / 2
-
     def take(self, shot: Shot) -> DepthFrame:
         """See `DepthSensor.take`. The lamp's light is rendered anyway, so shadow is explained."""
         window = shot.window
@@ -132,7 +124,7 @@ class TimeOfFlight(DepthSensor):
         sine_part = buckets[:, 1] - buckets[:, 3]
         amplitude = np.hypot(cosine_part, sine_part) / 2
         phase = np.arctan2(sine_part, cosine_part) % (2 * np.pi)
-        half_path, disagreement = unwrapped(phase, amplitude, self.frequencies_hz, self._farthest_m)
+        half_path, disagreement = unwrapped(phase, amplitude, self.frequencies_hz)
         depth = self._depth(window, half_path)
 
         middle = (slice(self.supersampling // 2, None, self.supersampling),) * 2
@@ -218,19 +210,15 @@ def unwrapped(
     phase: np.ndarray,
     amplitude: np.ndarray,
     frequencies_hz: tuple[float, ...],
-    farthest_m: float = math.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The distance on which all frequencies agree best.
 
     Every number of whole periods of the first frequency is tried; what the others then lack is
     weighed with 1 / sigma^2, which is proportional to (f A)^2 as the buckets' mean is common.
-    Frequencies without a large common divisor (100 and 33.333 MHz: 1 kHz) repeat only after
-    kilometres: of more than 64 periods those up to `farthest_m` are tried.
 
     Args:
         phase, amplitude: [F, h, w] in 0..2 pi, and in electrons, for the weights.
         frequencies_hz: F of them.
-        farthest_m: half the path to the farthest place that is looked for.
 
     Returns:
         [h, w] half the path in metres, in 0..c / (2 gcd); [h, w] the largest difference of one
@@ -244,10 +232,7 @@ def unwrapped(
     common = math.gcd(*(round(value) for value in frequencies_hz))
     best = np.full(phase.shape[1:], np.inf)
     found, worst = np.zeros_like(best), np.zeros_like(best)
-    count = round(frequencies_hz[0] / common)
-    if count > _ALL_TURNS and math.isfinite(farthest_m):
-        count = min(count, math.ceil(farthest_m / float(period[0, 0, 0])))
-    for turns in range(count):
+    for turns in range(round(frequencies_hz[0] / common)):
         guess = distance[0] + turns * period[0]
         lack = (distance - guess + period / 2) % period - period / 2  # [F, h, w], first is 0
         shift = (share * lack).sum(axis=0)

@@ -1,4 +1,7 @@
-"""Matching by normalised correlation, of two images or against a stored one."""
+"""Matching by normalised correlation, of two images or against a stored one.
+
+By compiled loops where numba is, with the same values.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,9 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from annotated_types import Ge, Interval
+from annotated_types import Ge
 
-from qs3.sensors.matching.base import Match, linearised
+from qs3.sensors.matching.base import Match
 from qs3.sensors.optics.visibility import Reason, first_reason
 from qs3.utils.jit import has_numba
 from qs3.utils.settings import IsOdd, settings
@@ -95,10 +98,6 @@ class NormalisedCorrelation:
         steps_per_px: quantiser of the matcher itself; 0 is none.
         min_score: matches with a lower correlation are dropped.
         uniqueness: the best score beats every score more than 2 px away by this much.
-        max_difference_px: how far the whole disparities found from `image` and from `other` may
-            be apart; -1 switches the check off.
-        a_factor: see `linearised`; 0 leaves the parabola's locking, up to 0.02 to 0.04 px on
-            synthetic dots at 16 phases. 0.18 takes it below 0.01 px there.
     """
 
     window_px: Annotated[int, Ge(3), IsOdd] = 9
@@ -107,8 +106,6 @@ class NormalisedCorrelation:
     steps_per_px: Annotated[int, Ge(0)] = 0
     min_score: float = 0.35
     uniqueness: float = 0.04
-    max_difference_px: int = -1
-    a_factor: Annotated[float, Interval(ge=-1, le=1)] = 0.0
 
     @property
     def reach_px(self) -> int:
@@ -121,40 +118,21 @@ class NormalisedCorrelation:
         last = len(scores) - 1
         found = winner(scores)
         best, top, lower, upper = found.place, found.top, found.lower, found.upper
-        consistent = self._agrees(scores, best)
         inner = (best > 0) & (best < last)
         unique = top - found.second >= self.uniqueness
-        valid = inner & (top >= self.min_score) & unique & consistent
+        valid = inner & (top >= self.min_score) & unique
 
         curvature = np.maximum(2 * top - lower - upper, np.float32(1e-6))
-        phase = linearised((upper - lower) / (2 * curvature), self.a_factor)
-        disparity = self.min_disparity + best + phase
+        disparity = self.min_disparity + best + (upper - lower) / (2 * curvature)
         if self.steps_per_px:
             disparity = np.rint(disparity * self.steps_per_px) / self.steps_per_px
         causes = {
             Reason.OUTSIDE: top <= -1,
             Reason.UNMATCHED: top < self.min_score,
             Reason.AMBIGUOUS: inner & ~unique,
-            Reason.INCONSISTENT: inner & ~consistent,
         }
         why_not = first_reason(causes, Reason.UNMATCHED)
         return Match.of(np.where(valid, disparity, np.nan).astype(np.float32), why_not)
-
-    def _agrees(self, scores: np.ndarray, best: np.ndarray) -> np.ndarray:
-        """[h, w] bool: whether the pixel found in the other image finds back."""
-        if self.max_difference_px < 0:
-            return np.ones(best.shape, dtype=bool)
-        count, height, width = scores.shape
-        # Column u meets, at place k, column u + count - 1 - k counted from the leftmost one.
-        top = np.full((height, width + count - 1), -np.inf, dtype=np.float32)
-        back = np.zeros(top.shape, dtype=np.intp)
-        for k, score in enumerate(scores):
-            met = slice(count - 1 - k, count - 1 - k + width)
-            better = score > top[:, met]
-            top[:, met][better] = score[better]
-            back[:, met][better] = k
-        there = np.take_along_axis(back, np.arange(width) + count - 1 - best, axis=1)
-        return np.abs(there - best) <= self.max_difference_px
 
     def _scores(self, image: np.ndarray, reference: np.ndarray, first: int) -> np.ndarray:
         """[num_disparities, h, w] float32 normalised correlation; -1 outside the reference."""

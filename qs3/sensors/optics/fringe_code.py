@@ -39,33 +39,30 @@ class FringeCode:
         steps: N, slides of each.
         columns, rows: of a slide. A renderer interpolates slides linearly, so a period needs at
             least 8 pixels; with 16 the sinusoid's error is 0.4 % (its harmonics 15 and 17).
-        along_rows: fringes change from row to row, not from column to column.
     """
 
     periods: tuple[Positive, ...] = (1.0, 8.0, 64.0)
     steps: Annotated[int, Ge(3)] = 4
     columns: Annotated[int, Ge(2)] = 1024
     rows: Annotated[int, Ge(2)] = 768
-    along_rows: bool = False
 
     def __post_init__(self) -> None:
         assert self.periods == tuple(sorted(set(self.periods))), "code.periods must increase"
         assert self.periods[0] <= 1, "code.periods must begin with at most 1 period"
-        length = self.rows if self.along_rows else self.columns
-        assert self.periods[-1] * _COLUMNS_A_PERIOD <= length, "a period needs 8 px of the slide"
+        assert self.periods[-1] * _COLUMNS_A_PERIOD <= self.columns, (
+            "a period needs 8 px of the slide"
+        )
 
     @cached_property
     def slides(self) -> np.ndarray:
         """[F, N, rows, columns] float32 in 0..1."""
-        length = self.rows if self.along_rows else self.columns
-        s = (np.arange(length) + 0.5) / length
+        s = (np.arange(self.columns) + 0.5) / self.columns
         angle = (
             2 * np.pi * np.multiply.outer(np.array(self.periods), s)[:, None]
             + (2 * np.pi / self.steps) * np.arange(self.steps)[None, :, None]
         )
         wave = ((1 + np.cos(angle)) / 2).astype(np.float32)  # [F, N, length]
-        wave = wave[..., :, None] if self.along_rows else wave[..., None, :]
-        return np.broadcast_to(wave, (*wave.shape[:2], self.rows, self.columns))
+        return np.broadcast_to(wave[..., None, :], (*wave.shape[:2], self.rows, self.columns))
 
     def decode(self, exposures: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places on the slide, from `exposures` [F, N, h, w] in the order of `slides`.

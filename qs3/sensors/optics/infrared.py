@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Interval
 
 from qs3.sensors.renderers.base import Image
-from qs3.utils.settings import Count, NotNegative, Positive, Share, settings
+from qs3.utils.settings import NotNegative, Positive, Share, settings
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,6 @@ class InfraredCamera:
         psf_px: standard deviation of the lens's point spread, a Gaussian; 0 is a perfect lens.
         fixed_gain: grey values per unit of radiance; null is automatic exposure. White at the
             sensor's reference distance has radiance 1.
-        speckle_grain_px: side of the square grains that share a value; 1 is a pixel.
         ambient_speckles: false: light that is not the projector's, and so no laser's, has no
             speckle; takes one more render a frame.
         metering: what the exposure goes by: "object", what bodies with a label show, or "image",
@@ -69,7 +68,6 @@ class InfraredCamera:
     speckle_contrast: Share = 0.0
     psf_px: Annotated[float, Interval(ge=0, le=10)] = 0.0
     fixed_gain: Positive | None = None
-    speckle_grain_px: Count = 1
     ambient_speckles: bool = True
     metering: Literal["object", "image"] | None = None
     max_exposure: Positive | None = None
@@ -135,10 +133,8 @@ class InfraredCamera:
 
     def _grains(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
         """[h, w] float32 Gamma variables with mean 1."""
-        (height, width), side = shape, self.speckle_grain_px
         k = 1 / self.speckle_contrast**2
-        few = rng.standard_gamma(k, (-(-height // side), -(-width // side)), dtype=np.float32)
-        return (few / np.float32(k)).repeat(side, axis=0).repeat(side, axis=1)[:height, :width]
+        return rng.standard_gamma(k, shape, dtype=np.float32) / np.float32(k)
 
 
 # Logarithms to base 2 of the radiance where the curve begins and where it ends.

@@ -1,4 +1,4 @@
-"""What a factory's calibration leaves: lens distortion, and rows and columns that do not meet."""
+"""What a factory's calibration leaves: rows and columns that do not meet."""
 
 from __future__ import annotations
 
@@ -33,10 +33,6 @@ def smooth_field(window: Window, cell_px: float, rng: np.random.Generator) -> np
     return field * np.sqrt(2 / _WAVES)
 
 
-_STEPS = 8  # of the fixed point that undoes the distortion
-
-
-_Radial = Annotated[float, Interval(ge=-0.5, le=0.5)]
 _Shift = Annotated[float, Interval(ge=0, le=10)]
 
 
@@ -44,65 +40,42 @@ _Shift = Annotated[float, Interval(ge=0, le=10)]
 class Misalignment:
     """Errors that stay in a pair of rectified images, the same in each frame of a device.
 
-    A ray (x, y, 1) is seen at (x, y) (1 + k1 r^2 + k2 r^4), r^2 = x^2 + y^2 (Brown's radial model),
-    in both images; and the right image is shifted by two smooth fields, one along the rows and one
-    along the columns, as by a lens that the calibration's polynomial does not follow. Shifts across
-    the rows cost matches; those along them are a bias of the disparity, and so of the depth.
+    The right image is shifted by two smooth fields, one along the rows and one along the columns,
+    as by a lens that the calibration's polynomial does not follow. Shifts across the rows cost
+    matches; those along them are a bias of the disparity, and so of the depth.
 
     Attributes:
-        k1, k2: radial distortion that is left.
         rows_px: RMS shift across the rows (vertical), in px.
         columns_px: RMS shift along the rows (horizontal), in px.
         cell_px: shortest wave of the fields, in px.
         seed: of the fields: the device.
     """
 
-    k1: _Radial = 0.0
-    k2: _Radial = 0.0
     rows_px: _Shift = 0.0
     columns_px: _Shift = 0.0
     cell_px: Positive = 300.0
     seed: int = 0
 
     @property
-    def distorts(self) -> bool:
-        """Whether there is anything to do at all."""
-        return any((self.k1, self.k2, self.rows_px, self.columns_px))
+    def reach_px(self) -> int:
+        """By how much a pixel is shifted at most: four times the fields' RMS."""
+        return math.ceil(4 * max(self.rows_px, self.columns_px))
 
-    def reach_px(self, k: Intrinsics) -> int:
-        """By how much a pixel is shifted at most (fields: four times their RMS)."""
-        if not self.distorts:
-            return 0
-        x, y = k.width_px / 2 / k.focal_px, k.height_px / 2 / k.focal_px
-        # The distortion is at its largest on the way out or in the corner.
-        share = np.linspace(0, 1, 50)
-        square = (x * x + y * y) * share**2
-        radial = np.abs(self.k1 * square + self.k2 * square**2) * np.sqrt(square) * k.focal_px
-        return math.ceil(radial.max() * 1.5 + 4 * max(self.rows_px, self.columns_px))
-
-    def seen(self, image: np.ndarray, canvas: Window, k: Intrinsics, *, right: bool) -> np.ndarray:
-        """The picture [h, w] float32 that this pair has instead of the ideal `image`.
+    def seen(self, image: np.ndarray, canvas: Window, k: Intrinsics) -> np.ndarray:
+        """The picture [h, w] float32 of the right camera in place of the ideal `image`.
 
         `canvas` is where its pixels lie in the whole image, whose intrinsics are `k`.
         """
-        radial = bool(self.k1 or self.k2)
-        shifted = right and bool(self.rows_px or self.columns_px)
-        if not radial and not shifted:
+        if not self.reach_px:
             return image
         u = np.arange(canvas.width, dtype=np.float64) + canvas.left
         v = np.arange(canvas.height, dtype=np.float64)[:, None] + canvas.top
         x, y = np.broadcast_arrays((u - k.cx_px) / k.focal_px, (v - k.cy_px) / k.focal_px)
-        ideal_x, ideal_y = x, y
-        for _ in range(_STEPS if radial else 0):
-            square = ideal_x**2 + ideal_y**2
-            stretch = 1 + self.k1 * square + self.k2 * square**2
-            ideal_x, ideal_y = x / stretch, y / stretch
-        at_u = ideal_x * k.focal_px + k.cx_px - canvas.left
-        at_v = ideal_y * k.focal_px + k.cy_px - canvas.top
-        if shifted:
-            rng = np.random.default_rng([0x3EC7, self.seed])
-            at_v = at_v - self.rows_px * smooth_field(canvas, self.cell_px, rng)
-            at_u = at_u - self.columns_px * smooth_field(canvas, self.cell_px, rng)
+        at_u = x * k.focal_px + k.cx_px - canvas.left
+        at_v = y * k.focal_px + k.cy_px - canvas.top
+        rng = np.random.default_rng([0x3EC7, self.seed])
+        at_v = at_v - self.rows_px * smooth_field(canvas, self.cell_px, rng)
+        at_u = at_u - self.columns_px * smooth_field(canvas, self.cell_px, rng)
         # Not OpenCV's cubic: it rounds places to 1/32 px, and is up to 0.05 px off on a ramp.
         found = map_coordinates(image, [at_v, at_u], order=3, mode="grid-constant")
         return np.maximum(found, 0)  # a spline undershoots beside bright dots

@@ -96,23 +96,6 @@ def test_unwrapping_finds_every_distance_in_range(frequencies, shares, amplitude
     assert disagreement.max() < 1e-6
 
 
-def test_of_very_many_periods_those_in_range_are_tried():
-    """Frequencies whose common divisor is 1 kHz or 1 Hz, as which nobody would write them."""
-    true = np.linspace(0.1, 7.9, 40)[None]
-    for other in (33.333e6, 33_333_333.0):
-        frequencies = (100e6, other)
-        f = np.array(frequencies)[:, None, None]
-        phase = (4 * np.pi * f * true / SPEED_OF_LIGHT) % (2 * np.pi)
-        found, worst = unwrapped(phase, np.ones_like(phase), frequencies, farthest_m=8.0)
-        np.testing.assert_allclose(found, true, atol=1e-6)
-        assert worst.max() < 1e-6
-    # Of few periods all: what is out of range is not taken for something in it.
-    f = np.array([80e6, 16e6])[:, None, None]
-    phase = (4 * np.pi * f * 9.0 / SPEED_OF_LIGHT) % (2 * np.pi)
-    found, _ = unwrapped(phase, np.ones_like(phase), (80e6, 16e6), farthest_m=6.0)
-    assert found == pytest.approx(9.0)
-
-
 def edge_scene(camera, near, far, share_of_pixel):
     """A near rectangle that ends inside pixels of one column, before a far one."""
     column = 170

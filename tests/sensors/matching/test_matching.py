@@ -27,21 +27,6 @@ def test_scores_equal_a_brute_force_correlation():
         assert scores[k, row, col] == pytest.approx(expected, abs=1e-3)
 
 
-def test_the_way_back_is_the_best_column_of_the_other_image():
-    scores = np.random.default_rng(6).random((4, 3, 7)).astype(np.float32)
-    best = scores.argmax(axis=0)
-    for limit in (0, 1):
-        agrees = NormalisedCorrelation(num_disparities=4, max_difference_px=limit)._agrees(
-            scores, best
-        )
-        for row in range(3):
-            for u in range(7):
-                x = u - best[row, u]  # column of the other image, up to a constant
-                back = {k: scores[k, row, x + k] for k in range(4) if 0 <= x + k < 7}
-                there = max(back, key=back.get)
-                assert agrees[row, u] == (abs(there - best[row, u]) <= limit)
-
-
 def test_the_reference_matcher_is_correlation_with_the_steps_of_a_kinect():
     texture = dots(60, 300, seed=10)
     reference = seen(texture, 0.0).astype(np.float32)

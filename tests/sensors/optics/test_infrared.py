@@ -34,19 +34,6 @@ def test_laser_speckle_has_the_contrast_it_says_and_grows_with_the_signal():
         assert grey.var() == pytest.approx((0.2 * level) ** 2 + 1 / 12, rel=0.03)
 
 
-def test_grains_of_laser_speckle_share_a_value():
-    camera = InfraredCamera(
-        electrons_at_white=1e9, read_noise_e=0.0, speckle_contrast=0.3, speckle_grain_px=3
-    )
-    flat = np.full((301, 401), 60.0, np.float32)
-    grey = camera.expose(flat, 1.0, np.random.default_rng(0)).astype(float)
-    assert grey.shape == flat.shape
-    np.testing.assert_allclose(grey[0:300:3, 0:399:3], grey[2:300:3, 2:399:3], atol=1)
-    apart = np.corrcoef(grey[0:300:3, 0:396:3].ravel(), grey[0:300:3, 3:399:3].ravel())[0, 1]
-    assert abs(apart) < 0.03
-    assert grey.std() / grey.mean() == pytest.approx(0.3, rel=0.03)
-
-
 def test_the_lens_spreads_a_point_as_a_gaussian():
     camera = InfraredCamera(electrons_at_white=1e9, read_noise_e=0.0, psf_px=1.5)
     point = np.zeros((31, 31), np.float32)

@@ -6,7 +6,10 @@ from qs3.sensors.renderers.base import RendererSettings
 from tests.sensors.renderers.scenes import RENDERERS
 
 
-@pytest.fixture(scope="session", params=list(RENDERERS))
+@pytest.fixture(
+    scope="session",
+    params=["blender", "mitsuba", pytest.param("mitsuba_scalar", marks=pytest.mark.slow)],
+)
 def shared(request):
     return RENDERERS[request.param]()
 

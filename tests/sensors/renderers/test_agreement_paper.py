@@ -10,7 +10,6 @@ import trimesh
 from omegaconf import OmegaConf
 
 from qs3.catalogue import Catalogue
-from qs3.config.compose import composed
 from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.generation.camera_poses import AnchoredViews
@@ -49,16 +48,8 @@ def mesh_of(name):
     return items[{"lamp": 1, "plant": 2}.get(name, 3)].load()
 
 
-def compare(
-    name, samples, window_px=None, gloss=None, light=None, materials=None, median_px=0.05, more=1
-):
-    """Check Blender against Mitsuba on one object; `window_px` limits the render to its middle.
-
-    Mitsuba takes `more` times as many samples.
-
-    `materials` dresses it, in place of `gloss`. With a wider `median_px` nothing is said of the
-    tail and of the bias.
-    """
+def compare(name, samples, window_px=None, gloss=None, light=None):
+    """Check Blender against Mitsuba on one object; `window_px` limits the render to its middle."""
     rng = np.random.default_rng(0)
     mesh = UnitCube().place(mesh_of(name), rng, name)
     (pose,) = AnchoredViews(count=1).poses(rng, mesh.bounds, name)
@@ -69,11 +60,8 @@ def compare(
     if window_px is not None:
         windows = middle_of(windows[0], window_px)
     middle = left.moved((SENSOR.baseline_m / 2, 0, 0)).world_from_camera
-    bodies = (Body(mesh, gloss=gloss),)
-    if materials is not None:
-        bodies = materials.dress(bodies, np.random.default_rng(1))
     scene = Scene(
-        bodies,
+        (Body(mesh, gloss=gloss),),
         Projector(middle, SENSOR.pattern.slide, SENSOR.tan_half_width, strength=16.0),
         SENSOR.ambient if light is None else light.ambient,
         None if light is None else light.over(mesh.bounds).area,
@@ -86,8 +74,7 @@ def compare(
     images, found = [], []
     # Other seeds, so that it is not the same sampling pattern that makes them agree.
     for seed, make in enumerate((BlenderRenderer, MitsubaRenderer)):
-        many = samples * (more if make is MitsubaRenderer else 1)
-        seen = make(samples=many).render(scene, pair, seed=seed, geometry=[True, False])
+        seen = make(samples=samples).render(scene, pair, seed=seed, geometry=[True, False])
         gain = NO_NOISE.gain(seen[0].radiance, seen[0].label > 0)
         grey = [NO_NOISE.expose(image.radiance, gain, rng) for image in seen]
         images.append(seen[0])
@@ -97,14 +84,7 @@ def compare(
     difference = (found[0] - found[1])[both]
     fill = [100 * np.isfinite(match)[on].mean() for match in found]
     middle, tail_px = np.percentile(np.abs(difference), [50, 95])
-    print(  # noqa: T201
-        f"median {middle:.4f} px, 95 % {tail_px:.3f} px, bias {np.median(difference):+.4f} px, "
-        f"fill {fill[0]:.1f} and {fill[1]:.1f} %, {len(bodies)} bodies"
-    )
-    assert middle < median_px
-    assert abs(fill[0] - fill[1]) < 2
-    if median_px > 0.05:
-        return
+    assert middle < 0.05
     # Of a metal most pixels are dark: noise of samples is as large as what there is to match.
     tail = 1.0 if gloss is not None and gloss.metal else 0.5
     assert tail_px < tail
@@ -126,7 +106,13 @@ def middle_of(window, side_px):
     return [Window(left, top, width, height), Window(left - last, top, wider, height)]
 
 
-@pytest.mark.parametrize("name", [*FURNITURE, *SOLIDS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "chair",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in (*FURNITURE, *SOLIDS) if n != "chair"),
+    ],
+)
 def test_disparities_agree_in_a_window(name):
     compare(name, samples=8, window_px=180)
 
@@ -138,36 +124,6 @@ def test_disparities_agree_on_shiny_bodies_in_the_paper_s_light(name, gloss):
     """The light of conf/light/area.yaml."""
     light = build(OmegaConf.load(CONF / "light" / "area.yaml").light)
     compare(name, samples=16, window_px=180, gloss=gloss, light=light)
-
-
-def materials_of(name, **kinds):
-    """What conf/materials says, some of its weights changed."""
-    node = composed("generate", "domain=specklenet10", f"materials={name}").materials
-    for kind, weight in kinds.items():
-        node.kinds[kind].weight = weight
-    return build(node)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lit", [False, True])
-@pytest.mark.parametrize("name", ["chair", "bookshelf", "monitor"])
-def test_disparities_agree_on_bodies_of_several_materials(name, lit):
-    """conf/materials/mixed.yaml, below the projector alone and in conf/light/area.yaml."""
-    light = build(OmegaConf.load(CONF / "light" / "area.yaml").light) if lit else None
-    compare(name, samples=16, window_px=180, light=light, materials=materials_of("mixed"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("more", "median_px"), [(1, 0.1), (16, 0.06)])
-@pytest.mark.parametrize("name", ["chair", "bookshelf"])
-def test_disparities_agree_on_clear_bodies(name, more, median_px):
-    """conf/materials/clear.yaml with as much glass as all the rest; looser than on other bodies.
-
-    Whether a sample passes is drawn, and in Blender only what is behind depends on it, so that 16
-    of Mitsuba's are much noisier: it differs from itself with another seed by 0.11 px.
-    """
-    materials = materials_of("clear", glass=1.0)
-    compare(name, samples=16, window_px=140, materials=materials, median_px=median_px, more=more)
 
 
 @pytest.mark.slow

@@ -57,6 +57,7 @@ print(json.dumps([len(threads), bound]))
     not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
     reason="needs Linux and two processors",
 )
+@pytest.mark.slow
 def test_one_thread_starts_no_helpers():
     """Blender's idle helpers wait in a busy loop, and took a second worker's processor."""
     found = []

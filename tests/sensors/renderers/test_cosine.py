@@ -24,7 +24,7 @@ def rays(camera):
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("angle_deg", [0, 30, 60, 80])
+@pytest.mark.parametrize("angle_deg", [0, 60])
 @pytest.mark.parametrize("flip", [False, True], ids=["front", "back"])
 def test_plane_at_an_angle(renderer, angle_deg, flip):
     # Turned about the camera's y axis; the camera itself is turned and shifted in the world.

@@ -83,7 +83,11 @@ def test_the_light_between_falls_with_both_albedos(mitsuba):
 
 # Blender's dots light in spots, which leaves it noise; ours have the slide's mean.
 @pytest.mark.parametrize(
-    ("slide", "alike"), [(WHITE, 0.99), (dots(90, seed=3), 0.96)], ids=["white", "dots"]
+    ("slide", "alike"),
+    [
+        pytest.param(WHITE, 0.99, id="white", marks=pytest.mark.slow),
+        pytest.param(dots(90, seed=3), 0.96, id="dots"),
+    ],
 )
 def test_both_renderers_add_the_same_light(mitsuba, blender, slide, alike):
     ours, theirs = (indirect(renderer, corner(slide=slide)) for renderer in (mitsuba, blender))
@@ -118,7 +122,7 @@ def test_through_a_clear_sheet_the_wall_is_seen_in_light_that_came_through(mitsu
         assert image.radiance[50, 5] == pytest.approx(albedo * (ambient + 1 / BACK_M**2), rel=0.01)
 
 
-@pytest.mark.parametrize("count", [1, 6])
+@pytest.mark.parametrize("count", [1, pytest.param(6, marks=pytest.mark.slow)])
 def test_behind_sheets_there_may_be_nothing(count, mitsuba, blender):
     """Each adds a share of its own light, which those before it hold back; then it is dark."""
     t, ambient, albedo = 0.8, 0.5, 0.6
@@ -136,6 +140,7 @@ def test_behind_sheets_there_may_be_nothing(count, mitsuba, blender):
         assert middle_of(lit - even).mean() == pytest.approx(dots, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_area_light_passes_through_a_sheet(mitsuba, blender):
     pose = moved(0.0)
     area = AreaLight(pose, side_m=0.02, radiance=50.0)  # before the camera's middle
@@ -150,6 +155,7 @@ def test_the_area_light_passes_through_a_sheet(mitsuba, blender):
         assert share == pytest.approx(0.25, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_shiny_clear_sheet_is_the_same_in_both(mitsuba, blender):
     shiny = sheet(0.8, 0.1, specular=0.5)
     shiny = replace(shiny, gloss=replace(shiny.gloss, roughness=0.3))

@@ -82,17 +82,6 @@ def test_ambient_is_albedo_times_ambient_without_noise(renderer):
     assert off.mean() < 0.05  # only pixels on the outline mix the two
 
 
-def test_slide_is_black_outside(renderer):
-    slide = np.ones((10, 20), dtype=np.float32)
-    scene = Scene((wall(1.0),), Projector(np.eye(4), slide, tan_half_width=0.5))
-    camera = Camera(Intrinsics.centred(80, 80, 50.0), np.eye(4))
-    lit = one(renderer, scene, camera).radiance > 0.5
-    rows, cols = np.nonzero(lit)
-    # 2 * 0.5 * 50 px wide, half as high
-    assert abs(np.ptp(cols) + 1 - 50) <= 2
-    assert abs(np.ptp(rows) + 1 - 25) <= 2
-
-
 def test_shadow_is_on_the_far_side_of_the_projector(renderer):
     blocker = quad([[-0.1, -0.1, 1], [0.1, -0.1, 1], [0.1, 0.1, 1], [-0.1, 0.1, 1]])
     slide = np.ones((8, 8), dtype=np.float32)
@@ -193,22 +182,10 @@ def test_bodies_appear_where_they_are_projected(renderer):
         assert mass.sum() == pytest.approx((2 * half * 80 / z) ** 2, rel=0.02)
 
 
-def test_geometry_only_where_wanted(renderer):
-    camera = busy_camera(Window(40, 30, 8, 6))
-    first, second = renderer.render(busy_scene(), [camera, camera], seed=1, geometry=[False, True])
-    assert np.isinf(first.depth_m).all()
-    assert (first.label == 0).all()
-    assert (first.cosine == 0).all()
-    assert np.isfinite(second.depth_m).all()
-    assert first.depth_m.shape == second.depth_m.shape == first.radiance.shape == (6, 8)
-
-
 # --- windows, determinism, memory
 
 
-@pytest.mark.parametrize(
-    "window", [Window(31, 17, 40, 32), Window(0, 0, 7, 80), Window(90, 75, 6, 5)]
-)
+@pytest.mark.parametrize("window", [Window(31, 17, 40, 32), Window(90, 75, 6, 5)])
 def test_window_is_a_crop_of_the_whole(renderer, window):
     whole = one(renderer, busy_scene(), busy_camera())
     part = one(renderer, busy_scene(), busy_camera(window))
@@ -275,11 +252,6 @@ def test_memory_does_not_grow(renderer):
 
     before = render(10)
     assert render(40) - before < 10
-
-
-def test_nothing_is_printed(renderer, capfd):
-    one(renderer, busy_scene(), busy_camera())
-    assert capfd.readouterr() == ("", "")
 
 
 # --- words
