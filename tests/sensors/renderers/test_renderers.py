@@ -213,6 +213,7 @@ def test_threads_do_not_change_a_byte(renderer):
         assert busy_digest(renderer) == first
 
 
+@pytest.mark.slow
 def test_fresh_process_makes_the_same_bytes(renderer, request):
     name = request.node.callspec.params["shared"]
     code = (
@@ -232,6 +233,7 @@ def test_seed_changes_the_samples_but_not_the_geometry(renderer):
     np.testing.assert_array_equal(first.depth_m, second.depth_m)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow(renderer):
     renderer.settings = RendererSettings(samples=1)
     camera = busy_camera(Window(0, 0, 8, 8))
