@@ -210,16 +210,6 @@ def test_the_blind_columns_are_those_that_stereobm_leaves_empty(renderer):
             assert (frame.reason[:, : (168 - frame.left) // 4] == Reason.OUTSIDE).all()
 
 
-def test_a_sensor_with_impossible_settings_is_refused():
-    for wrong, why in (
-        ({"sample_offset_px": 4}, r"sample_offset_px must be null or in 0\.\.3"),
-        ({"projector_strength": 0}, "projector_strength must be > 0"),
-        ({"blind_left_px": 1080}, "blind_left_px must be in"),
-    ):
-        with pytest.raises(ConfigError, match=why):
-            SpeckleStereo(**wrong)
-
-
 def test_the_projector_strength_reaches_the_image(renderer):
     """Filmic has no automatic exposure: four times the light is another grey."""
     bodies, box = square(4.0, POSE)
