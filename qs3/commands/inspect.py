@@ -39,18 +39,16 @@ def inspect(
     from qs3.report.viewer import page
     from qs3.utils.files import make_folder, write_text
     from qs3.utils.pictures import save_png
-    from qs3.utils.progress import progress_bar
 
     opened = open_named(domain, _with(data_dir, overrides))
     data, split = opened.data, next(iter(opened.data.counts()))
-    with progress_bar(f"inspecting {opened.name}", total=min(sample, len(data))) as advance:
-        clouds = measured(opened, sample, seed, advance)
+    clouds = measured(opened, sample, seed)
     text, heading = domain_text(opened, clouds), f"{opened.label}, {split}"
     folder = make_folder(out or _OUT / _name(opened.name, opened.variant))
     write_text(folder / "inspection.csv", clouds.to_csv(index=False))
     write_text(folder / "inspection.txt", text + "\n")
     save_png(class_sheet(data, split, heading), folder / "clouds.png", colours=256)
-    part = part_of(opened, chosen(data, _TURNABLE), residuals=False)
+    part = part_of(opened, chosen(data, _TURNABLE), False)
     write_text(folder / "clouds.html", page(opened.label, [part]))
     if sheets:
         metres = opened.unit == "m"
@@ -81,19 +79,17 @@ def compare(
         qs3 compare roomscan10 objects b.published.file=FILE b.published.fold=0
     """
     from qs3.report.datasets import open_named
-    from qs3.report.inspection import COMPARE_STEPS, pair_text
     from qs3.report.inspection import compare as measure
+    from qs3.report.inspection import pair_text
     from qs3.report.sheets import scan_picture
     from qs3.utils.files import make_folder, write_json, write_text
     from qs3.utils.pictures import save_png
-    from qs3.utils.progress import progress_bar
 
     sides = []
     for side, name, other in (("a.", a, "b."), ("b.", b, "a.")):
         own = {k.removeprefix(side): v for k, v in overrides.items() if not k.startswith(other)}
         sides.append(open_named(name, _with(data_dir, own)))
-    with progress_bar(f"comparing {a} and {b}", total=COMPARE_STEPS) as advance:
-        facts = measure(sides[0], sides[1], seed, meshes, advance)
+    facts = measure(sides[0], sides[1], seed, meshes)
     text, names = pair_text(facts), [_name(one.name, one.variant) for one in sides]
     folder = make_folder(out or _OUT / "-".join(names))
     write_json(folder / "comparison.json", facts)

@@ -109,7 +109,7 @@ def page(
             cards = [_card(row, sample, classes, floor_m) for row, sample in some]
             groups.append((heading, total, note, cards))
     return render(
-        "predictions",
+        "predictions.html",
         title=title,
         found=found,
         predicted=len(predicted),

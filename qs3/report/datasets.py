@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from qs3.report.viewer import Part, Shown
 from qs3.store.manifest import ManifestRow, read_manifest
 from qs3.store.meta import MadeOf
 from qs3.store.store import PointSet, is_finished, open_pointset, open_table
+from qs3.utils.progress import progress_bar
 from qs3.utils.seeding import object_rng
 
 _SAMPLES = 8192  # of a surface
@@ -95,8 +96,7 @@ def opened_domain(domain: Domain, data: PointSet) -> Opened:
     """A domain whose dataset is open."""
     rows = tuple(read_manifest(domain.folder, data.classes))
     where = (domain.name, domain.label, domain.folder, domain.variant)
-    unit = "m" if domain.unit == "metres" else ""
-    return Opened(*where, data, rows, domain.made_of(data), unit)
+    return Opened(*where, data, rows, domain.made_of(data), "m" * (domain.unit == "metres"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,18 +157,16 @@ def surfaces_of(meta: Mapping[str, Any], meshes: Path | None = None) -> tuple[Su
     return Surfaces(int(settings["seed"]), make(**placing), {item.id: item for item in items}), ""
 
 
-def distance_to_mesh(
-    points: Float[np.ndarray, "p 3"], mesh: Mesh, rng: np.random.Generator
-) -> Float[np.ndarray, " p"]:
+def distance_to_mesh(points: Float[np.ndarray, "p 3"], mesh: Mesh) -> Float[np.ndarray, " p"]:
     """Distance of each point to the surface, in the mesh's unit; exact.
 
     Samples of the surface bound the distance from above; then every triangle is tried whose ball
-    about its centre comes within the bound. `rng` decides how fast that is, not the result.
+    about its centre comes within the bound.
     """
     from trimesh.triangles import closest_point
 
     points = np.asarray(points, dtype=np.float64)
-    samples = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
+    samples = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, np.random.default_rng(0))
     best = cKDTree(samples).query(points)[0] * (1 + 1e-6)
     corners = mesh.vertices[mesh.faces]
     centres = corners.mean(axis=1)
@@ -197,13 +195,7 @@ def chosen(data: PointSet, most: int, match: str = "") -> list[int]:
     return sorted(taken[:most], key=lambda i: (data.labels[i], i))
 
 
-def part_of(
-    opened: Opened,
-    positions: Sequence[int],
-    *,
-    residuals: bool = True,
-    advance: Callable[[], None] = lambda: None,
-) -> Part:
+def part_of(opened: Opened, positions: Sequence[int], residuals: bool = True) -> Part:
     """Clouds of a dataset for the viewer, in this order.
 
     A residual is, of a dataset that was generated with `provenance=true`, how far the sensor's
@@ -214,7 +206,6 @@ def part_of(
         opened: the dataset.
         positions: of its clouds.
         residuals: also where they must be computed (some tenths of a second a cloud).
-        advance: is called after each cloud.
     """
     data, kept = opened.data, opened.kept
     table, names = None, tuple[str, ...]()
@@ -231,29 +222,23 @@ def part_of(
         surfaces, twin = surfaces_of(data.meta)[0], opened.twin
         words = "distance to the mesh" if surfaces else "distance to the clean twin's nearest point"
     shown = []
-    for i in positions:
-        points = np.asarray(data.points[i], dtype=np.float64)
-        view, residual = column(_VIEW, i), column(_RESIDUAL, i)
-        if residual is not None:
-            residual = np.where(residual == _NO_RESIDUAL_M, np.nan, np.abs(residual))
-        elif surfaces is not None:
-            mesh = surfaces.mesh(kept[i])
-            rng = np.random.default_rng(0)
-            residual = None if mesh is None else distance_to_mesh(points, mesh, rng)
-        elif twin is not None:
-            residual = np.asarray(cKDTree(twin.points[i]).query(points)[0])
-        label = data.labels[i]
-        shown.append(
-            Shown(
-                data.ids[i],
-                points,
-                label="" if label < 0 else data.classes[label],
-                note=", ".join(filter(None, (kept[i].origin, kept[i].more.get("tier", "")))),
-                view=None if view is None else view.astype(np.int64),
-                residual=residual,
-            )
-        )
-        advance()
+    with progress_bar("clouds", total=len(positions)) as advance:
+        for i in positions:
+            points = np.asarray(data.points[i], dtype=np.float64)
+            view, residual = column(_VIEW, i), column(_RESIDUAL, i)
+            if residual is not None:
+                residual = np.where(residual == _NO_RESIDUAL_M, np.nan, np.abs(residual))
+            elif surfaces is not None:
+                mesh = surfaces.mesh(kept[i])
+                residual = None if mesh is None else distance_to_mesh(points, mesh)
+            elif twin is not None:
+                residual = np.asarray(cKDTree(twin.points[i]).query(points)[0])
+            label = "" if data.labels[i] < 0 else data.classes[data.labels[i]]
+            note = ", ".join(filter(None, (kept[i].origin, kept[i].more.get("tier", ""))))
+            views = None if view is None else view.astype(np.int64)
+            one = Shown(data.ids[i], points, label, note=note, view=views, residual=residual)
+            shown.append(one)
+            advance()
     about = f"{len(shown)} of {len(data)} clouds of {opened.label}, made of: {opened.made_of}"
     known = any(one.residual is not None for one in shown)
     return Part(shown, about, opened.unit, words if known else "")

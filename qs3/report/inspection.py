@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,11 @@ from scipy.spatial import cKDTree
 from qs3.errors import ConfigError
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample, unit_ball
 from qs3.report.datasets import Opened, distance_to_mesh, surfaces_of
+from qs3.report.sheets import drawn
 from qs3.store.manifest import ManifestRow
 from qs3.store.store import PointSet
+from qs3.utils.page import render
+from qs3.utils.progress import progress_bar
 
 NET_POINTS = 1024
 """Two datasets are compared with so many points a cloud, by farthest point sampling."""
@@ -31,8 +34,6 @@ AZIMUTHS, RINGS = 12, 6
 VOXEL = 0.125
 """Side of a voxel in units of the unit ball."""
 
-COMPARE_STEPS = 5
-
 _OUTLIER = 5.0  # a point is lonely if its 4th neighbour is so many times the cloud's median away
 _ODD_SIZE = 5.0  # an object's size is odd so many robust standard deviations from its class
 _USUAL = 8  # clouds of a class, to know what is usual: of three one is soon far from the others
@@ -40,14 +41,12 @@ _FEATURED = 60  # clouds a class that are compared
 _SURFACES = 20  # objects a class whose distance to the surface is measured,
 _SURFACE_POINTS = 512  # with so many points of each, at random
 _SLICES, _SLICED_POINTS = 10, 512
-_COLUMNS = ("tier", "sensor", "vertical")  # of an imported dataset's manifest
+_COLUMNS = ("sub", "tier", "sensor", "vertical")  # of an imported dataset's manifest
 _SPACED = (
     *("nn_low", "nn_median", "nn_high", "nn_variation", "voxel_variation", "lonely"),
     *("directions", "below"),
 )
 _DENSITY = ("nn_median", "nn_variation", "voxel_variation", "directions", "below", "lonely")
-
-Advance = Callable[[], None]
 
 
 def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
@@ -103,21 +102,16 @@ def coverage(ball: Float[np.ndarray, "p 3"]) -> tuple[float, float]:
     return float(hit.mean()), float(hit[: RINGS // 3].mean())
 
 
-def measured(
-    opened: Opened, sample: int, seed: int = 0, advance: Advance = lambda: None
-) -> pd.DataFrame:
-    """A row for each of up to `sample` clouds, drawn with `seed`: id, class, split, `one_cloud`.
-
-    `advance` is called once a cloud.
-    """
+def measured(opened: Opened, sample: int, seed: int = 0) -> pd.DataFrame:
+    """A row for each of up to `sample` clouds, drawn with `seed`: id, class, split, `one_cloud`."""
     data, rows = opened.data, []
-    some = np.random.default_rng(seed).permutation(len(data))[:sample]
-    for i in np.sort(some) if len(data) > sample else range(len(data)):
-        label = data.labels[i]
-        name = "unlabelled" if label < 0 else data.classes[label]
-        known = {"id": data.ids[i], "class": name, "split": str(data.splits[i])}
-        rows.append(known | one_cloud(data.points[i]))
-        advance()
+    some = drawn(np.arange(len(data)), sample, seed)
+    with progress_bar(f"inspecting {opened.name}", total=len(some)) as advance:
+        for i in some:
+            name = "unlabelled" if data.labels[i] < 0 else data.classes[data.labels[i]]
+            known = {"id": data.ids[i], "class": name, "split": str(data.splits[i])}
+            rows.append(known | one_cloud(data.points[i]))
+            advance()
     return pd.DataFrame(rows)
 
 
@@ -162,63 +156,34 @@ def copies(data: PointSet, rows: Sequence[ManifestRow]) -> dict[str, Any]:
 
 def domain_text(opened: Opened, clouds: pd.DataFrame) -> str:
     """Text about one dataset and its `measured` clouds."""
-    data, rows = opened.data, opened.rows
+    data, kept = opened.data, opened.kept
     counts = pd.DataFrame(data.counts()).reindex(data.classes).fillna(0).astype(int)
     counts.loc["unlabelled"] = [(data.labels[data.indices(s)] < 0).sum() for s in counts]
     counts["all"] = counts.sum(axis=1)
     counts = counts[counts["all"] > 0]
     counts.loc["all"] = counts.sum()
-    parts = [
-        f"{opened.label}: {opened.folder}, {opened.variant}",
-        f"made of: {opened.made_of}",
-        f"{len(data)} clouds of {data.points.shape[1]} points; content {data.sha256[:16]}",
-        f"\nclouds\n{counts.to_string()}",
-    ]
+    tables = []
     for column in _COLUMNS:
-        found = [(row.cls, row.more[column]) for row in opened.kept if row.more.get(column)]
+        found = [(row.cls, row.more[column]) for row in kept if row.more.get(column)]
         if found:
-            table = pd.crosstab(*map(list, zip(*found, strict=True)))
-            parts.append(f"\n{column}\n{table.rename_axis(index=None, columns=None).to_string()}")
-    names = pd.Series([(row.cls, row.more["sub"]) for row in opened.kept if row.more.get("sub")])
-    if len(names):
-        counts = ", ".join(f"{name} {n}" for (_, name), n in names.value_counts(sort=False).items())
-        parts.append(f"\nnames in the published dataset: {counts}")
-    points = [row.valid_points for row in opened.kept if row.valid_points is not None]
-    if points:
-        few = sum(n < data.points.shape[1] for n in points)
-        parts.append(f"\npoints before sampling: {np.median(points):.0f} (median), at least "
-                     f"{min(points)}; {few} clouds have too few: some are repeated")  # fmt: skip
-    left = pd.Series([row.status for row in rows if row.status != "ok"], dtype=str).value_counts()
-    parts += [f"left out: {n} {status}" for status, n in left.items()]
-    ball = ((clouds["radius"] - 1).abs() < 1e-3).mean() > 0.99
-    parts += [
-        f"\nsize ({'unit ball' if ball else 'as stored'}), spacing, density and coverage: medians "
-        f"of {len(clouds)} clouds",
-        _shapes(clouds).to_string(),
-        "spacing: to the nearest other point in units of the unit ball (5 %, median, 95 %), and as "
-        "stored; cv: standard deviation over mean of the spacing, and of the points in a voxel of "
-        "1/8; seen: share of 72 directions from the centroid with a point, of the lowest 24; "
-        "lonely: share of points far from all others",
-        f"centroid off the origin {clouds['off_centre'].median():.3g}, floor at "
-        f"{clouds['floor'].median():.3g} (medians)",
-    ]
-    if odd := odd_sizes(clouds):
-        more = ", ..." * (len(odd) > 5)
-        parts.append(f"odd sizes for their class: {len(odd)}: {', '.join(odd[:5])}{more}")
-    same = copies(data, rows)
-    parts += [
-        f"\npoints that repeat another one of their cloud: {clouds['copies'].mean():.2%}",
-        f"clouds that repeat another one: {same['clouds']}",
-        *(f"  {' = '.join(group)}" for group in same["groups"][:5]),
-        f"different meshes: {same['meshes']}",
-    ]
-    warnings = {
-        "leaks": "clouds in the test split and in another one, too",
-        "contradicting_labels": "repeated clouds with several labels",
-        "leaking_meshes": "meshes in the test split and in another one, too",
-    }
-    parts += [f"WARNING: {same[key]} {words}" for key, words in warnings.items() if same[key]]
-    return "\n".join(parts)
+            frame = pd.DataFrame(found, columns=["class", column])
+            tables.append(frame.value_counts(sort=False).unstack(fill_value=0).to_string())
+    points = pd.Series([row.valid_points for row in kept if row.valid_points is not None])
+    known = f"{points.median():.0f} (median), at least {points.min()}" if len(points) else ""
+    few = int((points < data.points.shape[1]).sum())
+    return render(
+        "inspection.txt",
+        opened=opened,
+        counts=counts.to_string(),
+        columns=tables,
+        points=known + (f"; {few} clouds have too few: some are repeated" if few else ""),
+        left_out=Counter(row.status for row in opened.rows if row.status != "ok"),
+        unit_ball=((clouds["radius"] - 1).abs() < 1e-3).mean() > 0.99,
+        clouds=clouds,
+        shapes=_shapes(clouds).to_string(),
+        odd=odd_sizes(clouds),
+        same=copies(data, opened.rows),
+    )
 
 
 def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
@@ -240,20 +205,13 @@ def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def compare(
-    a: Opened,
-    b: Opened,
-    seed: int = 0,
-    meshes: Path | None = None,
-    advance: Advance = lambda: None,
-) -> dict[str, Any]:
-    """The gap between two datasets; `advance` is called once a step of `COMPARE_STEPS`.
+def compare(a: Opened, b: Opened, seed: int = 0, meshes: Path | None = None) -> dict[str, Any]:
+    """The gap between two datasets.
 
     Args:
         a, b: the datasets.
         seed: of all draws.
         meshes: the folder that they were generated from, if it was one.
-        advance: is called after each step.
 
     Raises:
         ConfigError: they have no class in common.
@@ -269,13 +227,11 @@ def compare(
         labels.append(np.repeat(np.arange(len(common)), [len(of) for of in chosen]))
         clouds.append([_sampled(one.data.points[i], count) for i in np.concatenate(chosen)])
         values.append(pd.DataFrame([one_cloud(cloud) for cloud in clouds[-1]]))
-        advance()
         surfaces.append(surface(one, common, seed, meshes))
-        advance()
     shares = [pd.Series({cls: len(one.data.members(cls)) for cls in one.data.classes})
               for one in both]  # fmt: skip
     prior = pd.DataFrame({"A": shares[0], "B": shares[1]}).fillna(0)
-    found = {
+    return {
         "a": a.label,
         "b": b.label,
         "made_of_a": str(a.made_of),
@@ -288,8 +244,6 @@ def compare(
         "surface": surfaces,
         "told_apart": _told_apart(clouds, labels, values, len(common)),
     }  # fmt: skip
-    advance()
-    return found
 
 
 def surface(
@@ -313,7 +267,7 @@ def surface(
             mesh = None if surfaces is None else surfaces.mesh(kept[i])
             if mesh is not None:
                 some = rng.permutation(len(cloud))[:_SURFACE_POINTS]
-                distance = distance_to_mesh(cloud[some], mesh, rng)
+                distance = distance_to_mesh(cloud[some], mesh)
                 truth = surface_sample(mesh.vertices, mesh.faces, 4096, rng)
             elif twin is not None:
                 truth = np.asarray(twin.points[i], dtype=np.float64)
@@ -456,37 +410,10 @@ def pair_text(facts: Mapping[str, Any]) -> str:
         if any(value is not None for value in values):
             rows[words] = ["-" if v is None else form.format(v) for v in values]
     glance = pd.DataFrame.from_dict(rows, orient="index", columns=["A", "B"])
-    apart = facts["told_apart"]
-    truths = [
-        f"True surface of {side}: {of['truth']}" + (f": {of['reason']}" if "reason" in of else "")
-        for side, of in zip("AB", facts["surface"], strict=True)
-    ]
-    variation = (prior["A"] - prior["B"]).abs().sum() / 2
-    near = [[by, f"{apart[by]:.1%}"] for by in ("all", "shape", "density")]
-    parts = [
-        f"# A = {facts['a']}, B = {facts['b']}",
-        f"A is made of: {facts['made_of_a']}.\nB is made of: {facts['made_of_b']}.",
-        "## Class frequencies",
-        _markdown(shown, "class"),
-        f"Total variation {variation:.3f} (0: equal, 1: disjoint).",
-        "## The gap at a glance",
-        _markdown(glance),
-        f"Clouds of {facts['points']} points in the unit ball, as a net sees them: by farthest "
-        "point sampling where more are stored. Medians of up to 60 clouds a class, drawn with "
-        f"seed {facts['seed']}.",
-        ".\n".join(truths) + f". Distances are of up to {_SURFACES} objects a class; measured is "
-        f"the share of the surface that has a point within {WITHIN} of the unit ball.",
-        "## Told apart by their nearest neighbours",
-        _markdown(pd.DataFrame(near, columns=["by", "own domain"]).set_index("by"), "by"),
-        "Share of clouds whose most similar cloud is of their own domain (50 %: cannot be told "
-        f"apart, 100 %: two worlds). {apart['clouds']} clouds of each, equally many a class.",
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _markdown(frame: pd.DataFrame, corner: str = "") -> str:
-    from qs3.utils.text_table import markdown
-
-    cells = [[corner, *frame.columns], *([str(name), *row] for name, row in
-             zip(frame.index, frame.to_numpy().tolist(), strict=True))]  # fmt: skip
-    return "\n".join(markdown(cells, numbers=True))
+    return render(
+        "comparison.md",
+        **facts,
+        prior_table=shown.to_string(),
+        total_variation=(prior["A"] - prior["B"]).abs().sum() / 2,
+        glance=glance.to_string(),
+    )

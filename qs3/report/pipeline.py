@@ -86,7 +86,7 @@ class ScannedObject:
         a surface have no camera, and their distances no sign.
         """
         if not self.views:
-            return distance_to_mesh(self.cloud, self.mesh, np.random.default_rng(0))
+            return distance_to_mesh(self.cloud, self.mesh)
         counts = [int(np.isfinite(view.frame.depth_m).sum()) for view in self.views]
         eyes = np.stack([view.believed[:3, 3] for view in self.views])
         _, nearest = cKDTree(self.fused()).query(self.cloud)  # the point itself, but for rounding
@@ -102,14 +102,12 @@ def signed_distance_m(
     """
     points = np.asarray(points, dtype=np.float64)
 
-    def distance(at: np.ndarray) -> np.ndarray:
-        return distance_to_mesh(at, mesh, np.random.default_rng(0))
-
     away = points - eyes_m
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-    found = distance(points)
+    found = distance_to_mesh(points, mesh)
     step = 0.1 * found[:, None] * away
-    return np.where(distance(points + step) >= distance(points - step), found, -found)
+    on, back = (distance_to_mesh(points + side * step, mesh) for side in (1, -1))
+    return np.where(on >= back, found, -found)
 
 
 def scan_object(

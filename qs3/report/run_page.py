@@ -40,16 +40,6 @@ ROLES = ("source", "target")
 _CLOUDS, _POINTS = 30, 1024  # on the page: a quarter of a megabyte a run
 _FEATURES = 600  # clouds of each domain in the picture of features
 _WARMUP = "warmup_selected.pt"  # of qs3.selftraining.callback, which imports Lightning
-_TITLES = {
-    "curves": "Training",
-    "confusion": "Confusion of classes",
-    "pseudo_labels": "Pseudo-labels",
-    "classes": "Balance of classes",
-    "calibration": "Calibration",
-    "embedding": "Features of both domains",
-    "domains": "One object of each class",
-    "clouds": "Clouds to turn",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +73,8 @@ def draw(
     Raises:
         MissingDataError, DataError: see `read_run`.
     """
+    from omegaconf import OmegaConf
+
     run = read_run(folder)
     if config is not None:
         run = dataclasses.replace(run, config=config)
@@ -96,7 +88,9 @@ def draw(
         **({"embedding": lambda: _embedding(run, data_dir, packages)} if embed else {}),
         "domains": lambda: _domains(run, data_dir),
     }
-    pictures, skipped, clouds = {}, {}, {}
+    pictures: dict[str, Path] = {}
+    skipped: dict[str, str] = {}
+    clouds: dict[str, Any] = {"about": (), "notes": (), "data": None}
     for name, make in charts.items():
         path = out / f"{name}.png"
         path.unlink(missing_ok=True)
@@ -110,70 +104,26 @@ def draw(
             save_png(figure, path, colours=256 if name == "domains" else 0)
             pictures[name] = path
     try:
-        part = part_of_run(run, worst_first(run)[:_CLOUDS], data_dir, residuals=False)
+        part = worst_clouds(run, _CLOUDS, data_dir=data_dir, residuals=False)
         clouds = viewer([part], points=_POINTS)
     except Qs3Error as error:
         skipped["clouds"] = str(error)
-    write_text(out / PAGE, _page(run, pictures, skipped, clouds))
-    return Drawn(pictures, skipped, out / PAGE)
-
-
-def _page(
-    run: RunFiles,
-    pictures: Mapping[str, Path],
-    skipped: Mapping[str, str],
-    clouds: Mapping[str, Any],
-) -> str:
-    """The page as HTML, with its PNGs and clouds inside."""
-    from omegaconf import OmegaConf
-
-    settings = None if run.config is None else OmegaConf.to_yaml(dict(run.config), sort_keys=True)
-    return render(
-        "run",
+    m = run.metrics
+    page = render(
+        "run.html",
         title=run.title,
-        finished=run.metrics is not None,
-        facts=key_figures(run).items(),
-        quality=[] if run.metrics is None else quality_table(run.metrics.quality),
+        m=m,
+        teacher=m and chosen_in_words(m.selection.teacher),
+        student=m and m.rounds and chosen_in_words(m.selection.student),
+        quality=m and quality_table(m.quality),
         command=run.command,
-        pictures=[(_TITLES[name], path.read_bytes()) for name, path in pictures.items()],
-        skipped=[(_TITLES[name], reason) for name, reason in skipped.items()],
-        settings=settings,
-        **{"about": (), "notes": (), "data": None, **clouds},
+        pictures=[(name, path.read_bytes()) for name, path in pictures.items()],
+        skipped=skipped,
+        settings=run.config and OmegaConf.to_yaml(dict(run.config), sort_keys=True),
+        **clouds,
     )
-
-
-def key_figures(run: RunFiles) -> dict[str, str]:
-    """What the page shows first, in order."""
-    if run.metrics is None:
-        return {"epochs done": str(0 if run.history is None else len(run.history))}
-    m, final = run.metrics, run.metrics.final
-    found = {
-        "source": f"{m.source}, made of: {m.made_of.source}",
-        "target": f"{run.target}, made of: {m.made_of.target}",
-        "method": m.method,
-        "self-training": m.selftraining,
-        "model": m.model,
-        "clouds evaluated": str(final.n),
-    }
-    if final.accuracy is None:
-        found["accuracy"] = "not known: the target has no labels"
-    else:
-        found["accuracy"] = f"{final.accuracy:.1%}"
-        found["balanced accuracy"] = f"{final.balanced_accuracy:.1%}"
-        found["majority rate"] = f"{final.majority_rate:.1%}"
-    if final.calibration_error is not None:
-        note = run_charts.EVALUATION_ONLY
-        found["expected calibration error"] = f"{final.calibration_error:.1%} ({note})"
-    before = m.warmup.selected.scores.accuracy
-    if run.rounds and before is not None:
-        found["accuracy before self-training"] = f"{before:.1%}"
-    found["teacher selected by"] = chosen_in_words(m.selection.teacher)
-    if run.rounds:
-        found["student selected by"] = chosen_in_words(m.selection.student)
-    found["time"] = f"{m.times.seconds:.0f} s"
-    found["hash of the settings"] = m.hash
-    found["versions"] = ", ".join(f"{k} {v}" for k, v in m.versions.items())
-    return found
+    write_text(out / PAGE, page)
+    return Drawn(pictures, skipped, out / PAGE)
 
 
 def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | None:
@@ -240,36 +190,24 @@ def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[st
     return run_charts.embedding(title, features, np.concatenate(labels), domain, run.classes, names)
 
 
-def worst_first(run: RunFiles, match: str = "") -> list[int]:
-    """Positions in the run's predictions of ids that hold `match`; none without predictions.
+def worst_clouds(
+    run: RunFiles,
+    most: int,
+    match: str = "",
+    data_dir: str | Path | None = None,
+    residuals: bool = True,
+) -> Part:
+    """Clouds of the run's target with its predictions, for the viewer.
 
     First the errors, the most confident before the others; then all else, the least confident
     first.
-    """
-    p = run.predictions
-    if p is None:
-        return []
-    wrong = (p.labels >= 0) & (p.predicted != p.labels)
-    sure = p.probabilities.max(axis=1)
-    order = np.lexsort((np.where(wrong, -sure, sure), ~wrong))
-    return [int(i) for i in order if match in p.ids[i]]
-
-
-def part_of_run(
-    run: RunFiles,
-    positions: Sequence[int],
-    data_dir: str | Path | None = None,
-    *,
-    residuals: bool = True,
-    advance: Callable[[], None] = lambda: None,
-) -> Part:
-    """Clouds of the run's target with its result's predictions.
 
     Args:
         run: finished.
-        positions: in its predictions.
+        most: clouds.
+        match: a part of their ids.
         data_dir: where the datasets lie; None: where the run's config says.
-        residuals, advance: as `part_of`.
+        residuals: as `part_of`.
 
     Raises:
         MissingDataError: the run's target is not there, or there are no predictions.
@@ -278,12 +216,14 @@ def part_of_run(
     p, m = run.predictions, run.metrics
     if p is None or m is None:
         raise MissingDataError(f"{run.folder} has no predictions; repeat its command")
+    wrong = (p.labels >= 0) & (p.predicted != p.labels)
+    sure = p.probabilities.max(axis=1)
+    order = np.lexsort((np.where(wrong, -sure, sure), ~wrong))
+    chosen = [int(i) for i in order if match in p.ids[i]][:most]
     data = open_domain(run, "target", data_dir)
     place = {id_: i for i, id_ in enumerate(data.ids)}
-    rows = [place[p.ids[i]] for i in positions]
     opened = opened_domain(domain_of(run, "target", data_dir), data)
-    part = part_of(opened, rows, residuals=residuals, advance=advance)
-    sure = p.probabilities.max(axis=1)
+    part = part_of(opened, [place[p.ids[i]] for i in chosen], residuals)
     shown = [
         dataclasses.replace(
             one,
@@ -291,13 +231,12 @@ def part_of_run(
             called=p.classes[p.predicted[i]],
             sure=float(sure[i]) if np.isfinite(sure[i]) else None,  # JSON knows no NaN
         )
-        for one, i in zip(part.shown, positions, strict=True)
+        for one, i in zip(part.shown, chosen, strict=True)
     ]
-    wrong = int(((p.labels >= 0) & (p.predicted != p.labels)).sum())
-    order = f"{wrong} are wrong, the most confident first" if wrong else "in doubt first"
+    first = f"{wrong.sum()} are wrong, the most confident" if wrong.any() else "in doubt"
     about = (
-        f"{run.title}, target {run.target}: {len(shown)} of {len(p.ids)} clouds; {order}; the "
-        f"target is made of: {m.made_of.target}; trained on {m.source} ({m.made_of.source})"
+        f"{run.title}, target {run.target}: {len(shown)} of {len(p.ids)} clouds; {first} first; "
+        f"the target is made of: {m.made_of.target}; trained on {m.source} ({m.made_of.source})"
     )
     return dataclasses.replace(part, shown=shown, about=about)
 

@@ -21,7 +21,7 @@ from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.datasets import chosen, open_named, part_of
 from qs3.report.run_files import is_run, read_run
-from qs3.report.run_page import part_of_run, worst_first
+from qs3.report.run_page import worst_clouds
 from qs3.report.sheets import drawn
 from qs3.report.viewer import Part, Shown, page, points_each
 from qs3.store.store import is_finished
@@ -61,16 +61,10 @@ def _part(path: str, most: int, wanted: Wanted) -> Part:
     if is_finished(place) or (not place.exists() and path in choices("domain")):
         given = {"variant": wanted.variant, "paths.data_dir": str(wanted.data_dir or "")}
         opened = open_named(path, {key: value for key, value in given.items() if value})
-        positions = chosen(opened.data, most, wanted.match)
-        with progress_bar("clouds", total=len(positions)) as advance:
-            return part_of(opened, positions, residuals=wanted.residual, advance=advance)
+        return part_of(opened, chosen(opened.data, most, wanted.match), wanted.residual)
     if is_run(place):
         run = read_run(place)
-        positions = worst_first(run, wanted.match)[:most]
-        with progress_bar("clouds", total=len(positions)) as advance:
-            return part_of_run(
-                run, positions, wanted.data_dir, residuals=wanted.residual, advance=advance
-            )
+        return worst_clouds(run, most, wanted.match, wanted.data_dir, wanted.residual)
     if not place.exists():
         raise MissingDataError(f"{path} is neither there nor the name of a domain")
     return _archive(place, most, wanted) if is_archive(place) else _files(place, most, wanted)

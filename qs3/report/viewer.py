@@ -122,7 +122,7 @@ def viewer(parts: Sequence[Part], colour: str = "", points: int | None = None) -
 
 def page(title: str, parts: Sequence[Part], colour: str = "", points: int | None = None) -> str:
     """A page of clouds as HTML; see `viewer`."""
-    return render("clouds", title=title, **viewer(parts, colour, points))
+    return render("clouds.html", title=title, **viewer(parts, colour, points))
 
 
 def _data(shown: Sequence[Shown], colour: str) -> dict[str, Any]:

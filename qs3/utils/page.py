@@ -1,4 +1,4 @@
-"""HTML pages from the templates beside this module: one file each, with everything inside."""
+"""Pages and texts from the templates beside this module; a page has everything inside."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _TEMPLATES = Path(__file__).with_name("templates")
 
 
 def render(template: str, **values: Any) -> str:
-    """A page from a template, such as "run"; text in `values` is never taken for HTML.
+    """A page or a text from a template, such as "run.html"; values are never taken for HTML.
 
-    The page's policy lets a browser run the viewer's script alone, and load nothing.
+    A page's policy lets a browser run the viewer's script alone, and load nothing.
     """
-    return _environment().get_template(f"{template}.html.j2").render(**values)
+    return _environment().get_template(f"{template}.j2").render(**values)
 
 
 @functools.cache
@@ -30,7 +30,7 @@ def _environment() -> Environment:
 
     made = Environment(
         loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
+        autoescape=lambda name: str(name).endswith(".html.j2"),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
