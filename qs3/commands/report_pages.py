@@ -33,13 +33,13 @@ def pictures(
     split: Annotated[str, "whose clouds"] = "train",
     out: Annotated[Path | None, "a folder, or one .png of all (default DATA_DIR/pictures)"] = None,
 ) -> None:
-    """Contact sheets of domains: each one's clouds, class balance, one object of each class.
+    """Contact sheets of domains: each one's clouds, and one object of each class.
 
     Example:
         qs3 report pictures domains=modelnet10,specklenet10,kinectsim10
     """
     from qs3.datasets.domain import compose_domain
-    from qs3.report.sheets import class_picture, class_sheet, scan_picture
+    from qs3.report.sheets import class_sheet, scan_picture
     from qs3.utils.pictures import save_png
 
     found = [compose_domain(name, {"paths.data_dir": str(data_dir)}) for name in domains]
@@ -55,7 +55,6 @@ def pictures(
         if folder.suffix == ".png"
         else {
             folder / "domains.png": figure,
-            folder / "classes.png": class_picture({one.label: data[one.name] for one in found}),
             **{
                 folder / f"{one.name}.png": class_sheet(
                     data[one.name], split, f"{one.label}, {split}"

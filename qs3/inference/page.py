@@ -19,7 +19,7 @@ from qs3.evaluation.ood import MEASURES, OF_HEIGHTS, OF_METRES
 from qs3.inference.inputs import Sample
 from qs3.inference.scores import DISPUTED, STRANGE, Scores, disputed, kinds, right, scores
 from qs3.inference.table import Row
-from qs3.utils.page import render
+from qs3.utils.page import confusion_rows, render
 from qs3.utils.pictures import cloud_image, png, unit, value_image
 
 MOST_SHOWN = 300
@@ -123,7 +123,7 @@ def page(
         groups=groups,
         failed=[(row.file, row.reason) for row in rows if row.probabilities is None],
         most=MOST_SHOWN,
-        **(_matrix(found, classes) if found else {}),
+        confusion=confusion_rows(found.confusion, classes) if found else [],
     )
 
 
@@ -144,22 +144,6 @@ def _collapsed(predicted: Sequence[Row], classes: Sequence[str]) -> str:
         f"{times} of {len(predicted)} are called {classes[best]}: the net hardly distinguishes "
         "these clouds. Is up right, and were its training clouds like these?"
     )
-
-
-def _matrix(found: Scores, classes: Sequence[str]) -> dict[str, Any]:
-    """Labels by rows and predictions by columns, those that occur; darker is more of the row."""
-    matrix = found.confusion
-    there = [k for k in range(len(classes)) if matrix[k].sum() or matrix[:, k].sum()]
-    lines = []
-    for i in there:
-        total = int(matrix[i].sum())
-        cells = []
-        for j in there:
-            colour = "58,143,92" if i == j else "181,64,58"
-            share = 0.75 * matrix[i, j] / max(total, 1)
-            cells.append((int(matrix[i, j]), f"rgba({colour},{share:.2f})", i == j))
-        lines.append((classes[i], cells, int(matrix[i, i]), total))
-    return {"names": [classes[k] for k in there], "matrix": lines}
 
 
 def _card(row: Row, sample: Sample, classes: Sequence[str], floor_m: float | None) -> Any:

@@ -26,7 +26,7 @@ from qs3.report.sheets import scan_picture
 from qs3.report.viewer import Part, viewer
 from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.utils.files import make_folder, write_text
-from qs3.utils.page import render
+from qs3.utils.page import confusion_rows, render
 from qs3.utils.pictures import save_png
 from qs3.utils.seeding import derive
 
@@ -81,9 +81,6 @@ def draw(
     out = make_folder(run.folder / FOLDER if out is None else Path(out))
     charts: dict[str, Callable[[], Figure | str]] = {
         "curves": lambda: run_charts.curves(run),
-        "confusion": lambda: run_charts.confusion(run),
-        "pseudo_labels": lambda: run_charts.pseudo_labels(run),
-        "classes": lambda: run_charts.classes(run, _train_labels(run, data_dir)),
         "calibration": lambda: run_charts.calibration(run),
         **({"embedding": lambda: _embedding(run, data_dir, packages)} if embed else {}),
         "domains": lambda: _domains(run, data_dir),
@@ -116,6 +113,17 @@ def draw(
         teacher=m and chosen_in_words(m.selection.teacher),
         student=m and m.rounds and chosen_in_words(m.selection.student),
         quality=m and quality_table(m.quality),
+        confusion=m
+        and m.final.confusion
+        and confusion_rows(np.array(m.final.confusion), run.classes),
+        tables={
+            heading: frame.to_html(border=0, float_format="{:.2f}".format, na_rep="")
+            for heading, frame in (
+                ("Pseudo-labels: selected / confident", run_charts.pseudo_labels(run)),
+                ("Clouds by class", run_charts.class_counts(run, _train_labels(run, data_dir))),
+            )
+            if len(frame.columns)
+        },
         command=run.command,
         pictures=[(name, path.read_bytes()) for name, path in pictures.items()],
         skipped=skipped,

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qs3.report.run_charts import axes_of_figure, grouped_bars
 from qs3.store.manifest import ManifestRow
 from qs3.store.store import PointSet
 from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, save_png, sheet, turn_deg
@@ -151,19 +150,6 @@ def _same_object(sets: Sequence[PointSet], cls: str) -> list[np.ndarray | None]:
         name = best if best in own else next(iter(own), None)
         found.append(None if name is None else np.asarray(data.points[data.ids.index(name)]))
     return found
-
-
-def class_picture(domains: Mapping[str, PointSet]) -> Figure:
-    """A row of bars for each domain (by title): a bar a class and split, with its count."""
-    figure, axes = axes_of_figure(10, 0.4 + 2.3 * len(domains), len(domains), 1)
-    for ax, (title, data) in zip(axes, domains.items(), strict=True):
-        counts = {
-            f"{split} ({sum(of.values()):,})": np.array([of.get(cls, 0) for cls in data.classes])
-            for split, of in data.counts().items()
-        }
-        ax.set_title(title if data.labelled else f"{title}: no labels", fontsize=10, loc="left")
-        grouped_bars(ax, data.classes, counts)
-    return figure
 
 
 def _short(id_: str) -> str:

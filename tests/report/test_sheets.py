@@ -71,7 +71,7 @@ def test_command(tmp_path, capsys):
     domains = "domains=[specklenet10,kinectsim10]"
     places = [f"data_dir={tmp_path}", f"out={tmp_path / 'out'}"]
     assert main(["report", "pictures", domains, *places]) == 0
-    made = ("domains", "classes", "specklenet10", "kinectsim10")
+    made = ("domains", "specklenet10", "kinectsim10")
     paths = [tmp_path / "out" / f"{name}.png" for name in made]
     assert capsys.readouterr().out.split() == [str(path) for path in paths]
     assert all(map(not_blank, paths))
