@@ -143,15 +143,16 @@ def pseudo_labels(run: RunFiles) -> pd.DataFrame:
         kept = "thresholds" if getattr(record, "mu", None) is None else "mu"
         cells = zip(*(one.counts(run.classes, key) for key in ("selected", "confident", kept)),
                     strict=True)  # fmt: skip
-        columns[f"round {one.number}"] = {
-            **{name: f"{n:.0f}/{m:.0f}, {kept} {k:.2f}"
-               for name, (n, m, k) in zip(run.classes, cells, strict=True)},
-            "theta": getattr(record, "theta", np.nan),
-            "same label as before": getattr(record, "agreement", np.nan),
-            "precision (evaluation only)": getattr(judged, "precision", np.nan),
-            "recall (evaluation only)": getattr(judged, "recall", np.nan),
-        }  # fmt: skip
-    return pd.DataFrame(columns).dropna(how="all")
+        words = [f"{n:.0f}/{m:.0f}, {kept} {k:.2f}" if record else f"{n:.0f}" for n, m, k in cells]
+        shares = {
+            "theta": getattr(record, "theta", None),
+            "same label as before": getattr(record, "agreement", None),
+            "precision (evaluation only)": getattr(judged, "precision", None),
+            "recall (evaluation only)": getattr(judged, "recall", None),
+        }
+        known = {name: share for name, share in shares.items() if share is not None}
+        columns[f"round {one.number}"] = dict(zip(run.classes, words, strict=True)) | known
+    return pd.DataFrame(columns)
 
 
 def class_counts(run: RunFiles, train_labels: Int[np.ndarray, " n"] | None = None) -> pd.DataFrame:
