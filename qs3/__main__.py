@@ -14,11 +14,11 @@ python generate.py and python train.py); both have --help."""
 COMMANDS: Commands = {
     "quickstart": "qs3.commands.quickstart:quickstart",
     "doctor": "qs3.commands.doctor:doctor",
-    "download": "qs3.datasets.download.cli:DOWNLOAD",
+    "download": "qs3.commands.download:download",
     "inspect": "qs3.commands.inspect:inspect",
     "compare": "qs3.commands.inspect:compare",
     "view": "qs3.commands.view:view",
-    "scannet": "qs3.datasets.scannet.cli:SCANNET",
+    "scannet": "qs3.commands.scannet:scannet",
     "predict": "qs3.inference.cli:PREDICT",
     "export": "qs3.inference.cli:EXPORT",
     "report": REPORT,

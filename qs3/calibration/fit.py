@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.calibration.walls import Noise, Steps, Wall, find_bias, find_noise, find_steps, find_wall
-from qs3.datasets.frames.given import check_intrinsics, read_depth, read_intrinsics
+from qs3.datasets.depth_images import check_intrinsics, read_depth, read_intrinsics
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics
 from qs3.utils.pictures import blank, save_png

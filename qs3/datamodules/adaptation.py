@@ -19,8 +19,7 @@ from qs3.datamodules.batches import Batches, Piece, generator_of
 from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
-from qs3.datasets.domain import Domain
-from qs3.datasets.ensure_source import check_or_make
+from qs3.datasets.domain import Domain, check_or_make
 from qs3.utils.seeding import derive
 
 

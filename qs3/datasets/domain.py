@@ -5,41 +5,36 @@ Light on purpose: `train.py` asks `Domain.check` before it imports anything heav
 
 from __future__ import annotations
 
-import functools
 import itertools
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import os
+import shlex
+import subprocess
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from qs3.classes import class_list
-from qs3.config.checks import check_choice, check_float
 from qs3.config.compose import choices, composed
-from qs3.config.location import typed
-from qs3.datasets.importers import Importer, import_into, lie_deeper
-from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.store.manifest import read_manifest
-from qs3.store.meta import MadeOf
-from qs3.store.store import (
-    PointSet,
-    has_variant,
-    is_begun,
-    is_finished,
-    open_pointset,
-    read_meta,
-)
-from qs3.utils.plural import counted
+from qs3.config.location import python_command, typed
+from qs3.datasets.importing import Importer, import_into
+from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
+from qs3.store.meta import MadeOf, is_begun, is_finished, read_meta
+from qs3.store.store import PointSet, has_variant, open_pointset
+from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
-VARIANTS = ("points", "points_clean", "points_whole")
+Variant = Literal["points", "points_clean", "points_whole"]
 SCALES = ("unit_ball", "metres", "above_floor")
 """How clouds are as a net sees them: divided by their radius; of their size, about their centroid;
 or of their size, over the floor."""
 
+_GENERATE = ["python", "generate.py"]
 
-@dataclass(frozen=True)
+
+@settings
 class Domain:
     """Where a dataset is, what it is called, and what to do if it is not there.
 
@@ -50,7 +45,7 @@ class Domain:
         path: folder of the store.
         variant: which array of the store: "points", "points_clean" for the clean twin, or
             "points_whole" for the whole surface (generated with twins=[whole]).
-        twin_of: folder of a store that holds the same objects, and `variant` beside its clouds, if
+        twin_of: folder of a store that holds the same objects, and `variant` next to its clouds, if
             that store was generated; what `path` holds itself comes first.
         published: how to read the published files, if there are any: an `Importer`, or its
             config (instantiated when it is needed).
@@ -58,9 +53,9 @@ class Domain:
         gravity: the axis that points up in the store: "z"; or "none" for clouds in the frame of
             their camera, which training should not turn about z (protocol.augment.rotate_z=false).
         unit: of the store's coordinates, "metres"; or "none" if sizes mean nothing (CAD shapes,
-            clouds that were normalised) or nobody knows.
+            clouds that were normalised) or are not known.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
-            where the camera is the origin; None: nobody knows.
+            where the camera is the origin; None: not known.
         views: what training sees of a source: "stored", its clouds; "random", each time others of
             the views and twins that its store keeps (`qs3.datamodules.random_views`).
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
@@ -74,53 +69,27 @@ class Domain:
     name: str
     symbol: str
     title: str
-    path: str | Path
-    variant: str = "points"
-    twin_of: str | Path | None = None
-    published: Importer | Mapping[str, Any] | None = None
+    path: Path
+    variant: Variant = "points"
+    twin_of: Path | None = None
+    published: Any = None
     simulated: bool = False
-    gravity: str = "z"
-    unit: str = "none"
+    gravity: Literal["z", "none"] = "z"
+    unit: Literal["metres", "none"] = "none"
     floor_m: float | None = None
-    views: str = "stored"
+    views: Literal["stored", "random"] = "stored"
     how_to_get: str = ""
     make: str | None = None
     stand_in: str | None = None
     synthesis: Any = None
-    classes: str | Sequence[str] | None = None
-    expected_counts: Mapping[str, Sequence[int]] | None = None
+    classes: str | list[str] | None = None
+    expected_counts: dict[str, list[int]] | None = None
 
     def __post_init__(self) -> None:
-        if self.variant not in VARIANTS:
-            raise ConfigError(
-                f"domain {self.name}: variant is {self.variant!r}, expected one of {VARIANTS}"
-            )
-        if self.gravity not in ("z", "none"):
-            raise ConfigError(
-                f"domain {self.name}: gravity is {self.gravity!r}, but the clouds of a store stand "
-                "on z; let the importer turn them (its key `up`)"
-            )
-        check_choice(f"domain {self.name}: unit", self.unit, ("metres", "none"))
-        check_choice(f"domain {self.name}: views", self.views, ("stored", "random"))
         if self.views == "random" and self.variant != "points":
-            raise ConfigError(
-                f"domain {self.name}: views=random draws from what was measured, and its variant "
-                f"is {self.variant}: leave views out"
-            )
-        if self.floor_m is not None:
-            check_float(f"domain {self.name}: floor_m", self.floor_m)
-        object.__setattr__(self, "path", Path(self.path))
-        classes = class_list(self.classes)
-        if not classes or len(set(classes)) < len(classes):
-            raise ConfigError(f"domain {self.name}: classes are {list(classes)}: empty or twice")
-        for split, counts in (self.expected_counts or {}).items():
-            if len(counts) != len(classes):
-                raise ConfigError(
-                    f"domain {self.name}: expected_counts.{split} has "
-                    f"{counted(len(counts), 'number')} for "
-                    f"{counted(len(classes), 'class', 'classes')}: give one for each class, or "
-                    "expected_counts=null"
-                )
+            raise ConfigError(f"domain {self.name}: views=random needs variant=points")
+        if len(set(self.names)) < max(1, len(self.names)):
+            raise ConfigError(f"domain {self.name}: classes are {self.names}: empty or twice")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -130,10 +99,10 @@ class Domain:
     @property
     def folder(self) -> Path:
         """The store's folder as an absolute path."""
-        own = Path(self.path).absolute()
+        own = self.path.absolute()
         if self.twin_of is None or is_finished(own) or is_begun(own):
             return own
-        other = Path(self.twin_of).absolute()
+        other = self.twin_of.absolute()
         return other if has_variant(other, self.variant) else own
 
     @property
@@ -145,50 +114,33 @@ class Domain:
         """The reader of the published files, instantiated from its config if need be."""
         if self.published is None or isinstance(self.published, Importer):
             return self.published
-        from hydra.errors import InstantiationException
-        from hydra.utils import instantiate
+        from qs3.config.hydra import build
 
-        try:
-            return instantiate(self.published)
-        except InstantiationException as error:
-            raise ConfigError(
-                f"domain {self.name}: `published` is wrong: {error.__cause__ or error}"
-            ) from error
+        importer: Importer = build(self.published)
+        return importer
 
     def tell_of_judging(self, keys: str = "") -> None:
-        """Say so if the test clouds are to be looked at once; `keys` stands before the domain's."""
+        """Log if the test clouds are to be looked at once; `keys` stands before the domain's."""
         importer = self.importer()
         if importer is not None and (judges := importer.judges()):
-            log.info(
-                "%s: this looks at what judges, %s; %spublished.fold=0 looks at the part for "
-                "training alone",
-                self.label,
-                judges,
-                keys,
-            )
+            text = "%s: this looks at what judges, %s; %spublished.fold=0 does not"
+            log.info(text, self.label, judges, keys)
 
     def check_scale(self, scale: str) -> None:
-        """Find out whether a net can see the clouds at this scale.
+        """Find out whether a net can see the clouds at this scale, one of `SCALES`.
 
         Raises:
-            ConfigError: not one of `SCALES`; metres of clouds that are not in metres; heights above
-                a floor of which nobody knows where it is.
+            ConfigError: metres of clouds that are not in metres; heights above an unknown floor.
         """
-        if check_choice("data.scale", scale, SCALES) == "unit_ball":
-            return
-        if self.unit != "metres":
+        if scale != "unit_ball" and self.unit != "metres":
             raise ConfigError(
-                f"data.scale={scale}: the clouds of domain {self.name} are not in metres, or "
-                "nobody knows (its key `unit`). Set data.scale=unit_ball, choose a domain with "
-                "real sizes such as roomscan10, or, if you know that they are in metres, say so: "
-                "data.source.unit=metres or data.target.unit=metres"
+                f"data.scale={scale}: the clouds of domain {self.name} are not known to be in "
+                "metres; if they are, set data.source.unit=metres or data.target.unit=metres"
             )
         if scale == "above_floor" and self.floor_m is None:
             raise ConfigError(
-                f"data.scale=above_floor: nobody knows where the floor is in the clouds of domain "
-                f"{self.name} (its key `floor_m`). Set data.scale=metres, or say it: "
-                "data.source.floor_m=0 if objects stand on z = 0, data.target.floor_m=-1.25 if the "
-                "origin is a camera 1.25 m above the floor"
+                f"data.scale={scale}: the floor under the clouds of domain {self.name} is not "
+                "known; set data.source.floor_m=Z or data.target.floor_m=Z"
             )
 
     def check(self) -> None:
@@ -201,36 +153,24 @@ class Domain:
         importer = self.importer()
         published = importer if importer is not None and importer.is_there() else None
         if is_finished(self.folder):
-            if published is not None:
-                self._refuse_two(published)
+            if published is not None and "imported" not in read_meta(self.folder):
+                raise DataError(
+                    f"domain {self.name}: there are two datasets, one that was made here in "
+                    f"{self.folder} and the published files in {published.root}: move one away, or "
+                    "set published=null"
+                )
             return
         if published is not None:
             return
-        unfinished = is_begun(self.folder)
-        why = self._absent(importer)
         lines = [
-            f"domain {self.name}: {why}{self.label} is not there. Looked for:",
-            f"  {self.folder / 'meta.yaml'}{'   (begun but not finished)' * unfinished}",
-            *([f"  {Path(self.twin_of).absolute() / self.variant}.npy"] if self.twin_of else []),
-            *(f"  {pattern}" for pattern in (importer.looks_for() if importer else [])),
-            *lie_deeper(importer),
+            f"domain {self.name}: {self.label} is not there. Looked for:",
+            f"  {self.folder / 'meta.yaml'}",
+            *([f"  {importer.looks_for()}"] if importer else []),
+            *([f"Where to get it: {self.how_to_get.strip()}"] if self.how_to_get else []),
+            *([f"Make it:\n  {self.make}"] if self.make else []),
+            *([f"Or make a stand-in:\n  {self.stand_in}"] if self.stand_in else []),
         ]
-        if self.how_to_get:
-            lines.append(f"Where to get it: {self.how_to_get.strip()}")
-        if self.make:
-            verb = "Continue making it" if unfinished else "Make it"
-            lines.append(f"{verb}:\n  {self.make}")
-        if self.stand_in and not why:  # who named a folder mistyped it, and has clouds
-            lines.append(f"Or make a stand-in and use that one:\n  {self.stand_in}")
         raise MissingDataError(typed("\n".join(lines)))
-
-    def _absent(self, importer: Importer | None) -> str:
-        """What is wrong with the place that somebody named; "" if it is the config's own."""
-        if importer is None:
-            return ""
-        data_dir = Path(self.path).absolute().parent
-        usual = importer.place == data_dir or importer.place.is_relative_to(data_dir / "published")
-        return "" if usual else f"{importer.absent()}; "
 
     def open(self, verify: bool = True) -> PointSet:
         """Open the dataset; the first time, bring the published files into the store.
@@ -243,7 +183,7 @@ class Domain:
         importer = self.importer()
         if not is_finished(self.folder):
             assert importer is not None  # `check` passed
-            log.info("importing %s from %s", self.label, importer.looks_for()[0])
+            log.info("importing %s from %s", self.label, importer.root)
             import_into(self.folder, importer, name=self.folder.name, classes=self.names)
         elif importer is not None:
             self._refuse_stale(importer)
@@ -262,16 +202,11 @@ class Domain:
         """The same clouds in another array of the store, such as "points_whole".
 
         Raises:
-            DataError: the store lacks it; says how to get it.
+            DataError: the store lacks it.
         """
         if not self.has_array(name):
             twin = "whole" if name == "points_whole" else "exact,views"
-            raise DataError(
-                f"{self.folder} has no {name}.npy: generate it again with it, "
-                + typed(f"python generate.py domain={self.name} force=true twins=[{twin}]")
-                + " (its clouds will be the same), or set method.sees=scan, which takes the clouds "
-                "themselves"
-            )
+            raise DataError(f"{self.folder} has no {name}.npy: generate it with twins=[{twin}]")
         return replace(open_pointset(self.folder, name, verify=verify), floor_m=self.floor_m)
 
     def has_array(self, name: str) -> bool:
@@ -288,22 +223,8 @@ class Domain:
         importer = self.importer()
         if importer is not None and importer.is_there():
             raise DataError(
-                f"domain {self.name}: the published files of {self.label} are in {importer.root}, "
-                "and a dataset made here would be taken for them. Give it a place of its own with "
-                "paths.data_dir=PATH, move the published files away, or say that they are not "
-                "meant: domain.published=null here, data.source.published=null in training"
-            )
-
-    def _refuse_two(self, importer: Importer) -> None:
-        """Raise DataError if the store was not imported: which of the two is meant?"""
-        meta = read_meta(self.folder)
-        if "imported" not in meta:
-            raise DataError(
-                f"domain {self.name}: two datasets are there for {self.label}: in {self.folder} "
-                f"one that was made here ({MadeOf.of(meta)}), in {importer.root} the published "
-                "files. To use the published ones, delete or rename the first folder; to use the "
-                "one made here, move the published files away or set published=null (in training "
-                "data.source.published=null or data.target.published=null)"
+                f"domain {self.name}: its published files are in {importer.root}; to make another "
+                "one here give paths.data_dir=PATH, or set domain.published=null"
             )
 
     def made_of(self, dataset: PointSet) -> MadeOf:
@@ -326,54 +247,25 @@ class Domain:
         return problems
 
     def _refuse_stale(self, importer: Importer) -> None:
-        """Raise DataError if the store was imported by other settings or rules than today's."""
-        meta = read_meta(self.folder)
-        imported = meta.get("imported")
+        """Raise DataError if the store was imported by other settings, or from other files."""
+        imported = read_meta(self.folder).get("imported")
         if imported is None:  # generated here
             return
         now = importer.settings()
         if not importer.is_there():  # the published files were put away after the import
-            self._refuse_another(importer, Path(str(imported.get("folder", ""))))
             now.update({key: imported.get(key) for key in ("folder", "files") if key in now})
         if imported.get("on_error") == "stop":  # nothing was wrong, so nothing was left out
             now["on_error"] = "stop"
-        changed = {key for key in {*now, *imported} if now.get(key) != imported.get(key)}
-        if not changed:
-            rows = functools.partial(read_manifest, self.folder, meta["classes"])
-            if not (outdated := importer.outdated(rows)):
-                return
-            problem = f"{self.folder} was imported by an earlier version of qs3, which took "
-            problem += f"{outdated}; delete it"
-        elif changed == {"files"}:
-            origins = {row.origin for row in read_manifest(self.folder, meta["classes"])}
-            problem = f"{self.folder} is not what its folder holds today: "
-            problem += f"{importer.changes(origins)}; delete {self.folder}"
-        else:  # of other settings there is more to say than a digest
-            keys = sorted(changed - {"files"})
-            was, wanted = ({key: of.get(key) for key in keys} for of in (imported, now))
-            problem = f"{self.folder} was imported with {was}, the config says {wanted}; "
-            words = [f"published.{key}={_said(value)}" for key, value in was.items()]
-            plain = all(isinstance(value, bool | int | float | str) for value in was.values())
-            if plain and not changed & {"files", "folder", "format"}:
-                problem += f"say {' '.join(words)} to take it as it is, "
-            problem += "delete it"
-        raise DataError(f"{problem} to import it again, or give another `path`")
-
-    def _refuse_another(self, importer: Importer, was: Path) -> None:
-        """Raise DataError for a mistyped name; by the name alone, because all may have moved."""
-        why = self._absent(importer)
-        if why and was.name and importer.root.name != was.name:
-            told = f"{self.folder} holds what was in {was}: give that, or a folder that is there"
-            raise DataError(f"domain {self.name}: {why}{told} (and another `path`)")
-
-
-def _said(value: object) -> str:
-    """A value as a word of the command line has it."""
-    return str(value).lower() if isinstance(value, bool) else str(value)
+        if changed := sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k)):
+            was, wanted = ({key: of.get(key) for key in changed} for of in (imported, now))
+            raise DataError(
+                f"{self.folder} was imported with {was}, and now it is {wanted}: delete it to "
+                "import it again, or give another `path`"
+            )
 
 
 def check_all(*domains: Domain) -> None:
-    """Check several domains and tell of all that are missing at once.
+    """Check several domains, and list all that are missing at once.
 
     Raises:
         MissingDataError: as `Domain.check`, for each one that is not there.
@@ -388,6 +280,41 @@ def check_all(*domains: Domain) -> None:
         raise MissingDataError("\n\n".join(problems))
 
 
+def check_or_make(source: Domain, target: Domain, make_source: bool) -> None:
+    """Find out, in milliseconds, whether both domains are there; make the source if that is asked.
+
+    Raises MissingDataError, which lists all that is missing, or as `make_if_missing`.
+    """
+    if make_source:
+        target.check()  # before minutes are spent on the source
+        make_if_missing(source)
+    check_all(source, target)
+
+
+def make_if_missing(domain: Domain) -> None:
+    """Run `generate.py` for a domain whose data are not there; it shows its progress.
+
+    An interrupted one goes on where it stopped when it is called again.
+
+    Raises:
+        MissingDataError: the domain is published, not generated.
+        Qs3Error: the generation failed; its message is on the terminal.
+    """
+    try:
+        domain.check()
+        return
+    except MissingDataError:
+        words = shlex.split(domain.make or "")
+        if words[:2] != _GENERATE:
+            raise
+    if int(os.environ.get("LOCAL_RANK", 0)) > 0:
+        return  # the first process makes it
+    log.info("%s is not there and is made: %s", domain.label, typed(shlex.join(words)))
+    done = subprocess.run([*python_command("generate"), *words[2:]], check=False)
+    if done.returncode:
+        raise Qs3Error(f"domain {domain.name} could not be made (exit status {done.returncode})")
+
+
 def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
     """conf/domain/NAME.yaml with changes, instantiated.
 
@@ -396,10 +323,7 @@ def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
     """
     known = choices("domain")
     if name not in known:
-        raise ConfigError(
-            f"domain={name} is unknown; there are {', '.join(known)}, or give the folder of a "
-            "dataset (with a / in it)"
-        )
+        raise ConfigError(f"domain={name} is unknown; there are {', '.join(known)}, or a folder")
     words = [
         f"{key if key.startswith('paths.') else f'domain.{key}'}={value}"
         for key, value in overrides.items()

@@ -10,7 +10,7 @@ r"""Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
         data.source.classes=[box,cup] domain@data.target=own data.target.path=data/theirs \
         data.target.classes=[box,cup]
 
-PyG is imported here and by nobody else in qs3.data: import this module when you want it. Its own
+PyG is imported here and nowhere else in qs3.datasets: import this module when you want it. Its own
 neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges from ours.
 """
 
@@ -26,7 +26,6 @@ from torch import Tensor
 from torch_geometric.data import Data, Dataset, InMemoryDataset
 
 from qs3.classes import class_list
-from qs3.config.checks import check_int
 from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.neighbours import knn
@@ -34,7 +33,6 @@ from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.store.manifest import ManifestRow
 from qs3.store.meta import MadeOf
 from qs3.store.store import PointSet, is_begun, is_finished, write_pointset
-from qs3.utils.plural import counted
 
 
 class Clouds(InMemoryDataset):
@@ -109,12 +107,9 @@ def from_pyg(
         name: of the new dataset; None: that of the folder.
 
     Raises:
-        ConfigError: there is something in the folder, the classes are not known or not told apart,
-            or `points` is no number of points.
+        ConfigError: there is something in the folder, or the classes are not known.
         DataError: a cloud does not fit; names split and position.
     """
-    if points is not None:
-        points = check_int("points", points, 1)
     folder = Path(folder)
     if is_finished(folder) or is_begun(folder):
         raise ConfigError(f"{folder} holds something already; delete it or choose another folder")
@@ -123,23 +118,15 @@ def from_pyg(
         for split, dataset in datasets.items()
         for number in range(len(dataset))  # PyG's way of iterating needs an IndexError to end
     }
-    if not taken:
-        raise DataError("there are no clouds in these datasets")
     names = _classes(classes, next(iter(datasets.values())), [y for _, y, _ in taken.values()])
     sizes = [len(pos) for pos, _, _ in taken.values()]
     if points is None and len(set(sizes)) > 1:
-        raise DataError(
-            f"the clouds have {min(sizes)} to {max(sizes)} points: give points=, to which larger "
-            "ones are thinned"
-        )
+        raise DataError(f"clouds of {min(sizes)} to {max(sizes)} points: give points=")
     points = sizes[0] if points is None else points
     clouds, rows = [], []
     for (split, number), (pos, y, key) in taken.items():
         if len(pos) < points:
-            raise DataError(
-                f"cloud {number} of {split!r} has {counted(len(pos), 'point')}, fewer than "
-                f"points={points}; leave it out or give a smaller number"
-            )
+            raise DataError(f"cloud {number} of {split!r} has {len(pos)} points, not {points}")
         thinned = farthest_point_sampling_np(pos, points) if len(pos) > points else slice(None)
         clouds.append(pos[thinned])
         cls = "" if y is None else names[y]
@@ -157,39 +144,19 @@ def from_pyg(
 
 
 def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str | int | None]:
-    """Points [n, 3] float32, label and id of one cloud, checked."""
+    """Points [n, 3] float32, label and id of one cloud."""
     pos, y, key = (getattr(item, key, None) for key in ("pos", "y", "id"))
     if getattr(item, "face", None) is not None:
         raise DataError(f"{where} is a mesh: give the dataset transform=SamplePoints(n)")
     if not isinstance(pos, Tensor) or pos.ndim != 2 or pos.shape[1] != 3 or len(pos) == 0:
-        raise DataError(f"{where} has no points: pos is {_shape(pos)}, expected [n, 3]")
-    label = None
-    if y is not None:
-        y = torch.as_tensor(y)
-        if y.numel() != 1 or y.is_floating_point() or y.is_complex():
-            raise DataError(f"{where}: y is {_shape(y)}, expected one whole number, the class")
-        label = int(y)
-    with np.errstate(over="ignore"):  # becomes infinite, and is reported as such
-        points = pos.detach().cpu().numpy().astype(np.float32)
-    if not np.isfinite(points).all():
-        raise DataError(f"{where} has points that are NaN or infinite")
-    return points, label, _id(key, where)
-
-
-def _id(key: Any, where: str) -> str | int | None:
-    """A name, or a number, which a collated dataset has as a tensor; None if there is neither."""
-    said = key.tolist() if isinstance(key, Tensor | np.ndarray | np.generic) else key
-    if isinstance(said, list) and len(said) == 1:
-        (said,) = said
-    if said is None or said == "":
-        return None
-    if isinstance(said, bool) or not isinstance(said, str | int):
-        raise DataError(f"{where}: id is {_shape(key)}, expected a name or a whole number")
-    return said
-
-
-def _shape(value: Any) -> str:
-    return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else repr(value)[:40]
+        raise DataError(f"{where} has no points pos [n, 3]")
+    label = None if y is None else int(y)
+    if label is not None and label != y:
+        raise DataError(f"{where}: y is {y}, expected one whole number, the class")
+    # A collated dataset has a number as a tensor.
+    name: Any = key.item() if isinstance(key, Tensor | np.ndarray | np.generic) else key
+    points: np.ndarray = pos.detach().cpu().numpy().astype(np.float32)
+    return points, label, None if name == "" else name
 
 
 def _classes(
@@ -202,12 +169,9 @@ def _classes(
     if names is None and known:
         raise ConfigError(f"give classes=: {max(known) + 1} names or more, in the order of y")
     names = list(class_list(names))
-    if not names or not all(names) or len(set(names)) < len(names):
-        raise ConfigError(f"classes are {names}: none, without a name, or twice")
-    if known and not 0 <= min(known) <= max(known) < len(names):
-        raise DataError(
-            f"labels are {min(known)} to {max(known)}, but there "
-            f"{'is 1 class' if len(names) == 1 else f'are {len(names)} classes'}"
+    if len(set(names)) < len(names) or (known and not 0 <= min(known) <= max(known) < len(names)):
+        raise ConfigError(
+            f"labels are {min(known, default=0)} to {max(known, default=0)}, classes {names}"
         )
     return names
 
@@ -228,14 +192,12 @@ def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) ->
         points in order, and the neighbours of each from the nearest on.
 
     Raises:
-        DataError: `batch` is not sorted, or does not fit.
+        ValueError: `batch` is not sorted.
     """
-    if x.ndim != 2 or k < 1 or (batch is not None and batch.shape != x.shape[:1]):
-        raise DataError(f"knn_graph wants x [n, c], batch [n] and k >= 1, got x {list(x.shape)}")
     if batch is None:
         batch = x.new_zeros(len(x), dtype=torch.int64)
     elif (batch.diff() < 0).any():
-        raise DataError("knn_graph wants the points of each cloud together: batch is not sorted")
+        raise ValueError("batch is not sorted: the points of each cloud must be together")
     sizes = batch.unique_consecutive(return_counts=True)[1].tolist()
     if len(set(sizes)) == 1:
         return _edges(x.view(len(sizes), sizes[0], -1), k, loop)

@@ -2,7 +2,7 @@
 
 `RoomScan` imitates how real single-view datasets come about (NYU Depth V2, SUN RGB-D): somebody
 stands in a room, the object is somewhere in the picture, other things cover a part of it, an
-annotator draws its mask, and `qs3.datasets.frames.cutting` cuts by the same rules as it does there.
+annotator draws its mask, and `qs3.datasets.cutting` cuts by the same rules as it does there.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from qs3.config.checks import check_float, check_order, check_ranges
-from qs3.datasets.frames.cutting import cut, inliers, own_pixels
-from qs3.datasets.frames.images import DepthImage, Pinhole
-from qs3.datasets.frames.pieces import pieces
-from qs3.datasets.frames.rules import Rules
+from qs3.datasets.cutting import cut, inliers, own_pixels
+from qs3.datasets.depth_images import DepthImage, Pinhole
+from qs3.datasets.regions import Rules, pieces
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction

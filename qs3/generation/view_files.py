@@ -22,7 +22,6 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from qs3.datasets.clouds.arrays import read_npz
 from qs3.errors import DataError, Qs3Error
 from qs3.generation.provenance import photograph
 from qs3.geometry.cameras import Camera, Intrinsics
@@ -149,8 +148,8 @@ def load_views(root: Path, object_id: str) -> tuple[KeptView, ...]:
     found = []
     for path in view_folder(root, object_id).glob("view_*.npz"):
         try:
-            arrays = read_npz(path, lambda names: names)
-            found.append(_kept(int(path.stem.removeprefix("view_")), arrays))
+            with np.load(path, allow_pickle=False) as arrays:
+                found.append(_kept(int(path.stem.removeprefix("view_")), dict(arrays)))
         except Exception as error:  # arrays of any kind may be where others were
             raise DataError(f"{path} is damaged ({error}); generate the dataset again") from error
     return tuple(sorted(found, key=lambda view: view.number))

@@ -13,8 +13,8 @@ from typing import Any
 
 import torch
 
-from qs3.datasets.frames.given import read_intrinsics
-from qs3.datasets.importers.object_archive import is_archive, read_archive
+from qs3.datasets.depth_images import read_intrinsics
+from qs3.datasets.object_archive import is_archive, read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.prior import read_prior
 from qs3.inference import pretrained

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from qs3.datasets.frames.given import (
+from qs3.datasets.depth_images import (
     Intrinsics,
+    Pinhole,
     camera_of,
     check_intrinsics,
     check_metres,
     off_centre,
 )
-from qs3.datasets.frames.images import Pinhole
-from qs3.datasets.frames.pointed import Pointed, point_out
+from qs3.datasets.pointed import Pointed, point_out
 from qs3.errors import DataError
 
 

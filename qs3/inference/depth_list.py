@@ -52,7 +52,7 @@ class Shown:
         intrinsics: "fx,fy,cx,cy", or a file.
         folder: that the file of intrinsics is relative to.
         up: in camera coordinates; None: not known.
-        scale_m: metres a unit; None: see `qs3.datasets.frames.given`.
+        scale_m: metres a unit; None: see `qs3.datasets.depth_images`.
         label: what it is; "" if nobody said.
         wrong: the row cannot be understood, and why.
     """

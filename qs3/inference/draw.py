@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.datasets.clouds.files import npy_clouds, parse_clouds
-from qs3.datasets.frames.given import read_mask
+from qs3.datasets.clouds import npy_clouds, parse_clouds
+from qs3.datasets.depth_images import read_mask
 from qs3.errors import Qs3Error
 from qs3.inference.depth_list import Shown
 from qs3.inference.inputs import Sample, Unit

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.datasets.clouds.finite import checked
-from qs3.datasets.clouds.shape import check_shape
+from qs3.datasets.clouds import check_shape, checked
 from qs3.errors import DataError
 from qs3.utils.plural import counted
 

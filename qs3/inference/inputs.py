@@ -17,18 +17,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
-from qs3.datasets.clouds.files import SUFFIXES, CloudFile, parse_clouds
-from qs3.datasets.frames.cutting import Piece, faults
-from qs3.datasets.frames.given import (
+from qs3.datasets.clouds import SUFFIXES, CloudFile, parse_clouds, with_depth
+from qs3.datasets.cutting import Piece, faults
+from qs3.datasets.depth_images import (
     check_intrinsics,
     off_centre,
     read_depth,
     read_intrinsics,
     read_mask,
 )
-from qs3.datasets.frames.pointed import RULES, Caution, Pointed, point_out
-from qs3.datasets.importers.object_archive import ADAPT, JUDGE, Archive
-from qs3.datasets.with_depth import with_depth
+from qs3.datasets.object_archive import ADAPT, JUDGE, Archive
+from qs3.datasets.pointed import RULES, Caution, Pointed, point_out
 from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.depth_list import IMAGES, Shown

@@ -191,7 +191,7 @@ def _size(cloud: Float[np.ndarray, "n 3"], floor_m: float | None) -> str:
 
 def _z_up(sample: Sample) -> Float[np.ndarray, "n 3"]:
     """The cloud for pictures and sizes, whatever frame the net sees it in."""
-    from qs3.datasets.importers.base import turned
+    from qs3.datasets.importing import turned
 
     cloud = np.asarray(sample.cloud, dtype=np.float64)[:, :3]
     if sample.world_from_camera is not None:

@@ -31,10 +31,9 @@ from torch import Tensor, nn
 from qs3.config.checks import check_choice, check_int
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
-from qs3.datasets.frames.images import Pinhole
-from qs3.datasets.frames.pointed import Pointed
-from qs3.datasets.importers.base import UP_AXES, check_cloud
-from qs3.datasets.importers.folders import CloudFolder
+from qs3.datasets.depth_images import Pinhole
+from qs3.datasets.importing import UP_AXES, check_cloud, thinned, turned
+from qs3.datasets.pointed import Pointed
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, other_units, relax_min_points
@@ -158,12 +157,12 @@ class Predictor:
         """
         check_choice("up", up, UP_AXES)
         cloud = given_cloud(cloud, name)
-        # By the importer of one's own clouds, so that both ways give the same bits.
-        rules = CloudFolder(".", points=self.result.stored_points, up=up)
-        stored = rules.turn(check_cloud(rules.thin(cloud, name), rules.points, name), "")
+        # As the importer of one's own clouds, so that both ways give the same bits.
+        points = self.result.stored_points
+        stored = turned(check_cloud(thinned(cloud, points), points, name), up)
         stored = np.ascontiguousarray(stored)  # as on disk: sums take another order otherwise
         whole = stored[None]  # [1, P, 3]
-        some = self.points < rules.points
+        some = self.points < points
         order = sample(whole, self.points, 1) if some else None
         one = Clouds.of(whole, order, self.result.scale, self._floor(floor))
         usual = relax_min_points(self.result.usual, self.points)

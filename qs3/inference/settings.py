@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from qs3.config.checks import check_choice
-from qs3.datasets.importers.folders import UP_AXES
+from qs3.datasets.importing import UP_AXES
 from qs3.errors import ConfigError
 from qs3.evaluation.prior import POWER
 from qs3.inference.depth_list import check_scale

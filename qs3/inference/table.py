@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from qs3.datasets.frames.pointed import Caution
+from qs3.datasets.pointed import Caution
 from qs3.evaluation.prior import Prior
 from qs3.runs.metrics import Trust
 from qs3.utils.text_table import csv_text

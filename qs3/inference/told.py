@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from qs3.config.location import typed
-from qs3.datasets.frames.pointed import LEVEL, PLANES
-from qs3.datasets.with_depth import NOTHING
+from qs3.datasets.clouds import NOTHING
+from qs3.datasets.pointed import LEVEL, PLANES
 from qs3.evaluation.ood import OTHER_UNITS, other_units
 from qs3.inference.inputs import passed_over
 from qs3.inference.predictor import Predictor

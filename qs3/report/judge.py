@@ -20,7 +20,7 @@ import pandas as pd
 from jaxtyping import Int
 
 from qs3.classes import known_as
-from qs3.datasets.importers.object_archive import JUDGE, TIERS, Archive, read_archive
+from qs3.datasets.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, MissingDataError
 from qs3.inference.model_file import FILE, find_result
 from qs3.inference.predictor import Predictor, load

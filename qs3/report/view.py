@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from qs3.config.compose import choices
-from qs3.datasets.clouds.files import SUFFIXES, parse_clouds
-from qs3.datasets.clouds.finite import checked
-from qs3.datasets.importers.base import turned
-from qs3.datasets.importers.object_archive import JUDGE, is_archive, read_archive
-from qs3.datasets.with_depth import with_depth
+from qs3.datasets.clouds import SUFFIXES, checked, parse_clouds, with_depth
+from qs3.datasets.importing import turned
+from qs3.datasets.object_archive import JUDGE, is_archive, read_archive
 from qs3.errors import DataError, MissingDataError
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.inputs import find_files

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
-from qs3.datasets.ensure_source import check_or_make
+from qs3.datasets.domain import check_or_make
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import chosen_in_words
 from qs3.runs.folder import read_code

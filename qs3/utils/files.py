@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import Qs3Error
+from qs3.errors import DataError, MissingDataError, Qs3Error
 
 _CHUNK = 1 << 20
 
@@ -55,6 +55,25 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def reading(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn whatever the block raises on a damaged file into a DataError that names it.
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: anything else is wrong with it.
+    """
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise MissingDataError(f"there is no {path}") from error
+    except Exception as error:  # what damaged bytes do to a reader cannot be listed
+        if isinstance(error, Qs3Error) and str(path) in str(error):
+            raise
+        why = str(error).partition("\n")[0] or type(error).__name__
+        raise DataError(f"{path} cannot be read: {why}") from error
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:

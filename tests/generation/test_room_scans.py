@@ -14,8 +14,8 @@ from trimesh.proximity import closest_point_naive
 
 from qs3.catalogue import Catalogue
 from qs3.config.hydra import build
-from qs3.datasets.frames.images import DepthImage, Pinhole
-from qs3.datasets.frames.rules import Limits, Rules
+from qs3.datasets.depth_images import DepthImage, Pinhole
+from qs3.datasets.regions import Limits, Rules
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.checks import check, check_recipe

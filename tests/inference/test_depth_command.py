@@ -18,8 +18,8 @@ import pytest
 from PIL import Image
 
 import qs3
-from qs3.datasets.frames.images import Pinhole
-from qs3.datasets.frames.pointed import point_out
+from qs3.datasets.depth_images import Pinhole
+from qs3.datasets.pointed import point_out
 from qs3.errors import ConfigError, DataError
 from qs3.inference.model_file import read_result, write_result
 from qs3.runs.metrics import read_metrics

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from qs3.datasets.importers.arrays import named_arrays
+from qs3.datasets.arrays import named_arrays
 from qs3.errors import ConfigError
 from qs3.inference import pretrained
 from qs3.inference.floor import CAMERA_M, FEWEST, check_camera_height, check_floor, floor_under

@@ -9,7 +9,7 @@ import pytest
 
 import qs3
 from qs3.classes import CLASSES
-from qs3.datasets.importers.arrays import named_arrays
+from qs3.datasets.arrays import named_arrays
 from qs3.errors import MissingDataError
 from qs3.inference import pretrained
 from qs3.inference.export import export_folder

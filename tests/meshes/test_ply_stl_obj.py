@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.datasets.clouds.files import parse_cloud
+from qs3.datasets.clouds import parse_cloud
 from qs3.meshes.io import load_mesh
 from tests.meshes.written import PYRAMID, corners, export, mixed_ply, refused, save
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from qs3.classes import CLASSES
-from qs3.datasets.importers.object_archive import read_archive
+from qs3.datasets.object_archive import read_archive
 from qs3.errors import ConfigError, MissingDataError
 from qs3.inference.model_file import Result, write_result
 from qs3.inference.predictor import load

@@ -6,8 +6,6 @@ import os
 
 import pytest
 
-from qs3.datasets.frames.matlab import load_v5
-from qs3.datasets.scannet.labels import read_scene_list
 from qs3.errors import DataError
 from qs3.runs.folder import STARTED, read_started
 from qs3.runs.metrics import METRICS, read_metrics
@@ -21,7 +19,6 @@ READERS = {
     METRICS: lambda path: read_metrics(path.parent),
     "predictions.csv": read_predictions,
     "pseudo_labels.csv": read_pseudo_labels,
-    "scenes.txt": read_scene_list,
 }
 
 
@@ -35,14 +32,6 @@ def test_a_large_text_is_refused_before_it_is_read(name, tmp_path):
         pytest.raises(DataError, match=f"{name} takes .* GB of memory"),
     ):
         READERS[name](path)
-
-
-def test_matlab_files_count_with_what_they_become(tmp_path, monkeypatch):
-    path = tmp_path / "a.mat"
-    path.write_bytes(bytes(1 << 20))
-    monkeypatch.setenv("QS3_MEMORY_GB", "0.001")
-    with pytest.raises(DataError, match=r"a\.mat takes .* GB of memory"):
-        load_v5(path)
 
 
 def test_the_peak_is_what_counts(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from qs3.datasets.importers.object_archive import TIERS
+from qs3.datasets.object_archive import TIERS
 from qs3.errors import ConfigError, DataError
 from qs3.report.intervals import LEVEL, Interval, difference
 from qs3.report.tables.formats import marks, problems_of

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from qs3.datasets.importers.object_archive import TIERS
+from qs3.datasets.object_archive import TIERS
 from qs3.report.tables.results import COSTS, FEW_SEEDS, Runs, data_lines, task
 from qs3.report.tables.spec import Metric
 from qs3.report.tables.table import INCOMPLETE, METRICS, OTHER_DATA, Cell, Table

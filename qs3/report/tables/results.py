@@ -31,7 +31,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int
 
-from qs3.datasets.importers.object_archive import TIERS
+from qs3.datasets.object_archive import TIERS
 from qs3.errors import ConfigError, DataError
 from qs3.runs.folder import read_code
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.datasets.download.archives import unpack
+from qs3.datasets.download import unpack
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.command import generate
 from qs3.generation.plan import settings

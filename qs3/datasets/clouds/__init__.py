@@ -1,1 +1,0 @@
-"""Point clouds in files. Nothing in them is trusted."""

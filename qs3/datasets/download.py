@@ -1,0 +1,271 @@
+"""Published datasets, fetched when a person asks for one, and put where their importers look.
+
+Training never downloads. What there is, what it is for and under which terms stands in
+sources.yaml, which explains its keys.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import shutil
+import tarfile
+import zipfile
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped,unused-ignore]
+
+from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.utils.files import make_folder, reading, sha256_file, write_json
+from qs3.utils.locks import locked
+
+log = logging.getLogger(__name__)
+
+MARK = ".download.json"
+"""In a folder that was put in place: where it came from. Importers pass over hidden files."""
+
+_FILE: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("sources.yaml").read_text())
+
+BY_HAND: dict[str, dict[str, str]] = _FILE["by_hand"]
+"""What has to be fetched by hand: whether it `asks` for an agreement, its `terms`, and `how`."""
+
+
+class DownloadError(Qs3Error):
+    """A file could not be fetched, or is not the one that was wanted."""
+
+
+class AgreementError(Qs3Error):
+    """Terms have to be accepted first; the message says which and how."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One folder of an archive, and where it goes.
+
+    `holds` and `named` are regular expressions: for paths of files relative to the folder, of which
+    `at_least` so many must match, and for the folder's own name in the archive ("": any will do).
+    """
+
+    folder: str
+    holds: str
+    says: str
+    at_least: int
+    domains: tuple[str, ...]
+    named: str = ""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One archive that somebody publishes; sources.yaml explains the keys."""
+
+    name: str
+    title: str
+    terms: str
+    parts: tuple[Part, ...]
+    address: str
+    drive: str = ""
+    agreement: str = ""
+    size: int | None = None
+    sha256: str | None = None
+    size_says: str = "not known beforehand"
+
+    @property
+    def file(self) -> str:
+        """Its name in the folder of downloads and on a mirror."""
+        return f"{self.name}.zip" if self.drive else self.address.rpartition("/")[2]
+
+    @property
+    def domains(self) -> tuple[str, ...]:
+        """All that its parts are for."""
+        return tuple(domain for part in self.parts for domain in part.domains)
+
+
+def _part(layout: str, domains: list[str], suffix: str = "", **more: Any) -> Part:
+    values: dict[str, Any] = {
+        key: value.replace("SUFFIX", suffix) if isinstance(value, str) else value
+        for key, value in _FILE["layouts"][layout].items()
+    }
+    return Part(domains=tuple(domains), **values, **more)
+
+
+def _source(name: str, parts: list[dict[str, Any]], **more: Any) -> Source:
+    if "drive" in more:
+        more["address"] = f"https://drive.google.com/file/d/{more['drive']}/view"
+    return Source(name=name, parts=tuple(_part(**part) for part in parts), **more)
+
+
+SOURCES = {name: _source(name, **values) for name, values in _FILE["sources"].items()}
+
+
+def provide(
+    source: Source,
+    into: Path = Path("data"),
+    *,
+    accept_terms: str = "",
+    mirror: str = "",
+    archive: Path | None = None,
+    root: str = "",
+    keep: bool = True,
+) -> list[Path]:
+    """Bring the folders of a source to where their importers look; what is there stays.
+
+    Nothing is fetched if all its folders are in place. An interruption at any moment leaves no
+    half folder: the same call again starts over.
+
+    Args:
+        source: one of `SOURCES`.
+        into: the data folder, `paths.data_dir` of a run.
+        accept_terms: the agreement that the person has made, e.g. "scannet".
+        mirror: base address of a copy of the archives; each lies there as `Source.file`.
+        archive: an archive that is here already, e.g. downloaded with a browser.
+        root: folder in the archive to take, where it cannot be found out.
+        keep: keep the archive after unpacking; it is then not fetched again when a folder is lost.
+
+    Returns:
+        The folders, in the order of `source.parts`, also those that somebody else had put there.
+
+    Raises:
+        AgreementError: `source.agreement` was not accepted.
+        DataError: the archive is damaged, or holds something else.
+        DownloadError, Qs3Error: network, disk.
+    """
+    if source.agreement and accept_terms != source.agreement:
+        text, where = _FILE["agreements"][source.agreement], f" into={into}"
+        raise AgreementError(text.format(name=source.name, where=where, title=source.title))
+    if root and len(source.parts) > 1:
+        raise ConfigError(f"{source.name} has several parts, so root= cannot be given")
+    downloads, published = make_folder(into / "downloads"), into / "published"
+    places = {part: published / part.folder for part in source.parts}
+    with locked(downloads / f".{source.name}.lock"):
+        if missing := {part: at for part, at in places.items() if not _is_in_place(at, source)}:
+            path = archive or fetch(source, downloads / source.file, mirror)
+            _place(source, missing, path, root, published)
+            if archive is None and not keep:
+                path.unlink()
+    return list(places.values())
+
+
+def fetch(source: Source, path: Path, mirror: str = "") -> Path:
+    """Bring a source's archive to `path`; one that is there already is checked and left alone.
+
+    Raises:
+        DownloadError: network, or another file.
+    """
+    import pooch
+    import requests
+
+    url = f"{mirror.rstrip('/')}/{source.file}" if mirror else source.address
+    downloader = None if mirror or not source.drive else _from_drive(source.drive)
+    advice = f"open {source.address} in a browser and give the file with archive=PATH"
+    try:
+        pooch.retrieve(url, source.sha256, path.name, path.parent, downloader=downloader)
+    except (requests.RequestException, ValueError) as error:  # ValueError: another hash
+        raise DownloadError(f"{url}: {error}. Run the same command again, or {advice}") from error
+    if source.size not in (None, path.stat().st_size):
+        path.unlink()
+        raise DownloadError(f"{url} does not have {source.size} bytes; {advice}")
+    return path
+
+
+def _from_drive(file_id: str) -> Any:
+    """A downloader for pooch that leaves a file on Google Drive to gdown."""
+
+    def download(url: str, output_file: str, pooch: Any) -> None:
+        import gdown
+
+        try:
+            gdown.download(id=file_id, output=output_file, quiet=not os.isatty(2))
+        except gdown.exceptions.DownloadError as error:
+            raise ValueError(f"Google Drive does not give it: {error}") from error
+
+    return download
+
+
+def unpack(archive: Path, into: Path) -> list[str]:
+    """Unpack a .zip, .tar, .tar.gz, .tar.bz2 or .tar.xz, whatever its name, into a new folder.
+
+    Nothing is written outside of the folder: zipfile drops what leads out of names, tarfile's
+    filter refuses it. Mac OS's companions (`__MACOSX`, `._name`) are removed.
+
+    Returns:
+        The files, relative to `into`, with slashes.
+
+    Raises:
+        DataError: damaged, or not to be trusted.
+    """
+    with reading(archive):
+        if zipfile.is_zipfile(archive):
+            with zipfile.ZipFile(archive) as packed:
+                packed.extractall(into)
+        else:
+            with tarfile.open(archive) as packed_tar:
+                packed_tar.extractall(into, filter="data")
+    files = (path.relative_to(into) for path in sorted(into.rglob("*")) if path.is_file())
+    return [str(p) for p in files if "__MACOSX" not in p.parts and not p.name.startswith("._")]
+
+
+def find_folder(files: Iterable[str], holds: str, named: str = "", at_least: int = 10) -> str:
+    """The folder of an unpacked archive that an importer reads, however it is nested.
+
+    For `holds`, `named` and `at_least` see `Part`. `files` and the result are relative to the
+    archive's top, with slashes; "" is the top itself.
+
+    Raises:
+        DataError: there is none, or there are several.
+    """
+    name = rf"(?:.*/)?(?i:{named})/" if named else r"(?:.*/)?"
+    pattern = re.compile(rf"(?P<root>{name}){holds}")
+    roots = Counter(found["root"] for file in files if (found := pattern.fullmatch(file)))
+    large = sorted(root for root, count in roots.items() if count >= at_least)
+    if len(large) != 1:
+        raise DataError(f"folders with the wanted files: {', '.join(large) or 'none'}")
+    return large[0].rstrip("/")
+
+
+def _is_in_place(place: Path, source: Source) -> bool:
+    """Whether the folder is there; warns if it did not come from this source."""
+    if not place.exists() or not any(place.iterdir()):
+        return False
+    mark = place / MARK
+    origin = json.loads(mark.read_text())["source"] if mark.is_file() else "somewhere else"
+    if origin != source.name:
+        log.warning("%s is there already, from %s, and is left alone", place, origin)
+    return True
+
+
+def _place(
+    source: Source, missing: dict[Part, Path], archive: Path, root: str, published: Path
+) -> None:
+    """Unpack into a folder next to the final ones, find the parts, and rename them into place."""
+    building = published / f".{source.name}.unpacking"
+    shutil.rmtree(building, ignore_errors=True)  # what a killed run left
+    sha256 = sha256_file(archive)
+    log.info("%s: SHA-256 %s", archive, sha256)
+    try:
+        files, found = unpack(archive, building), {}
+        for part in missing:
+            try:
+                found[part] = root.strip("/") or find_folder(
+                    files, part.holds, part.named, part.at_least
+                )
+            except DataError as error:
+                raise DataError(
+                    f"{archive}: {error}. Wanted is {part.says}; take a folder with root=FOLDER, "
+                    f"of {sorted({file.rpartition('/')[0] for file in files})[:12]}"
+                ) from error
+        for part, place in missing.items():
+            folder = building / found[part]
+            mark = {"source": source.name, "root": found[part], "sha256": sha256}
+            write_json(folder / MARK, {**mark, "size": archive.stat().st_size})
+            make_folder(place.parent)
+            if place.is_dir():
+                place.rmdir()  # empty, see `_is_in_place`
+            os.rename(folder, place)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)

@@ -1,0 +1,311 @@
+"""Datasets of depth images: objects are cut from the frames when they are first used.
+
+That takes minutes, so each finished frame is kept in a file of its own next to the store to come,
+and an interrupted import goes on where it stopped; other settings begin anew. The readers are
+`qs3.datasets.nyuv2` and `qs3.datasets.sunrgbd`; raw ScanNet, whose objects are fused from many
+frames of a scene, shares `finish_parts` (`qs3.datasets.scannet`).
+"""
+
+from __future__ import annotations
+
+import abc
+import functools
+import hashlib
+import logging
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from annotated_types import Ge
+
+from qs3.datasets.cutting import CLEAN, HARD, Piece
+from qs3.datasets.importing import Importer, Item, check_cloud, report, thinned
+from qs3.datasets.regions import Rules
+from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.store.manifest import OK, SPLITS, ManifestRow
+from qs3.store.parts import PartFiles
+from qs3.utils.files import reading
+from qs3.utils.pool import Pool, Processes
+from qs3.utils.progress import progress_bar
+from qs3.utils.settings import settings
+from qs3.utils.version import VERSION
+
+log = logging.getLogger(__name__)
+
+COLUMNS = ("frame", "sensor", "sub", "tier", "why", "holes", "rim", "occ", "depth_m", "vertical")
+"""Further columns of the manifest."""
+
+_DIED = "the process died on it each time (out of memory, or a crash)"
+
+Part = tuple[dict[str, Any], dict[str, np.ndarray]]
+"""The note and the arrays of a finished part."""
+
+
+@dataclass(frozen=True)
+class FrameTask:
+    """One frame to cut, before it is read.
+
+    Attributes:
+        number: in the dataset, from 1.
+        split: "train" or "test".
+        cluster: what is not independent of it: its room, or the block of frames it is one of.
+        sensor: that took it.
+        vertical: how its vertical was found.
+        world_from_camera: `[3][3]` rotation to z up; None if the reader knows it.
+    """
+
+    number: int
+    split: str
+    cluster: str
+    sensor: str
+    vertical: str
+    world_from_camera: Sequence[Sequence[float]] | None = None
+
+    @property
+    def name(self) -> str:
+        """Of its part."""
+        return f"{self.number:06d}"
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """One object of a frame, cut or refused.
+
+    Attributes:
+        cls, sub: its class, and its name in the dataset.
+        origin: for a human.
+        piece: what was cut.
+    """
+
+    cls: str
+    sub: str
+    origin: str
+    piece: Piece
+
+
+Cutter = Callable[[FrameTask], list[Cut]]
+
+
+@settings
+class FrameDataset(Importer):
+    """A dataset of depth images; see the module.
+
+    Attributes:
+        names: name in the dataset -> class; names that are not in it are left alone.
+        rules: as `qs3.datasets.regions.Rules`.
+        tiers: which of "clean" and "hard" become clouds.
+        block: so many frames in a row make a cluster, where rooms are not known.
+        workers: processes; 0 works in this one. Their number changes no byte.
+    """
+
+    names: dict[str, str] = field(default_factory=dict)
+    rules: Rules = field(default_factory=Rules)
+    tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: [CLEAN, HARD])  # type: ignore[list-item]
+    block: Annotated[int, Ge(1)] = 30
+    workers: Annotated[int, Ge(0)] = 0
+
+    complete: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def files(self) -> Sequence[Path]:
+        """What is read at once; a change of them is noticed."""
+
+    @abc.abstractmethod
+    def tasks(self) -> list[FrameTask]:
+        """The frames of the official splits, in the dataset's order; DataError if damaged."""
+
+    @abc.abstractmethod
+    def cutter(self) -> Cutter:
+        """What cuts a frame; made once in each process, it may keep files open."""
+
+    def looks_for(self) -> str:
+        """See `Importer`."""
+        return " and ".join(map(str, self.files()))
+
+    def is_there(self) -> bool:
+        """See `Importer`."""
+        return all(path.is_file() for path in self.files())
+
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """Not used: frames are cut, not listed."""
+        raise NotImplementedError
+
+    def object_of(self, id_: str) -> str:
+        """See `Importer`: the room, or the block of frames; things in one room are not independent.
+
+        It is what stands before the frame and the object's number in the last part of an id.
+        """
+        return id_.rsplit("/", 1)[-1].rsplit("_", 2)[0]
+
+    def settings(self) -> dict[str, Any]:
+        """See `Importer`; with a digest of the files' sizes and times of change."""
+        values = super().settings()
+        del values["workers"]
+        stats = [path.stat() for path in self.files() if path.is_file()]
+        digest = hashlib.sha256(repr([(s.st_size, s.st_mtime_ns) for s in stats]).encode())
+        return {**values, "files": digest.hexdigest()}
+
+    def read(
+        self, classes: Sequence[str], work: Path
+    ) -> tuple[list[np.ndarray], list[ManifestRow]]:
+        """See `Importer`: cuts what is not cut yet, then puts all together.
+
+        Raises:
+            ConfigError: a name or a limit of a class that there is not.
+            DataError: a file is damaged, or nothing was cut.
+        """
+        limited = {*self.rules.limits} - {"default"}
+        if unknown := sorted({*self.names.values(), *limited} - {*classes}):
+            raise ConfigError(f"published.names or rules.limits: unknown classes {unknown}")
+        parts = self._begun(work)
+        tasks = self.tasks()
+        todo = [(task.name, task) for task in tasks if not parts.has(task.name)]
+        pool, make = Processes(self.workers), functools.partial(_worker, self)
+        failed = finish_parts(
+            parts, todo, make, pool, f"cutting objects from {self.root.name}",
+            stop=self.on_error == "stop",
+        )  # fmt: skip
+        found = [one for task in tasks for one in self._of_frame(parts, task, failed)]
+        label = {name: i for i, name in enumerate(classes)}
+        found.sort(key=lambda f: (SPLITS.index(f[0].split), label.get(f[0].cls, -1), f[0].id))
+        rows = [row for row, _ in found]
+        clouds = [cloud for row, cloud in found if row.status == OK and cloud is not None]
+        if not clouds:
+            raise DataError(f"{self.root}: no object of {len(tasks)} frames can be used")
+        tiers = Counter(row.more["tier"] for row in rows if row.status == OK)
+        log.info("%s: objects cut: %s", self.root, dict(sorted(tiers.items())))
+        report(rows, self.points, self.root)
+        return clouds, rows
+
+    def _begun(self, work: Path) -> PartFiles:
+        """The folder of parts: those of the same settings and versions, or none."""
+        versions = {"qs3": VERSION, "numpy": np.__version__, "scipy": version("scipy")}
+        recipe, parts = {"settings": self.settings(), "versions": versions}, PartFiles(work)
+        if parts.have_recipe:
+            try:
+                parts.check(recipe)
+            except Qs3Error:
+                log.info("settings, files or versions have changed: the frames are cut anew")
+                shutil.rmtree(work)
+        parts.begin(recipe)
+        return parts
+
+    def _of_frame(
+        self, parts: PartFiles, task: FrameTask, failed: Mapping[str, str]
+    ) -> Iterator[tuple[ManifestRow, np.ndarray | None]]:
+        """Rows of one frame's objects with their clouds."""
+        stem = f"{task.cluster}_{task.number:05d}"
+        more = {"frame": str(task.number), "sensor": task.sensor, "vertical": task.vertical}
+        if why := failed.get(task.name, ""):
+            id_ = f"{task.split}/{stem}"
+            yield ManifestRow(id_, "", task.split, status="skipped", reason=why, more=more), None
+            return
+        note, arrays = parts.read(task.name)
+        for i, one in enumerate(note["objects"]):
+            reason = one["reason"]
+            if not reason and one["more"]["tier"] not in self.tiers:
+                reason = f"{one['more']['tier']} ({one['more']['why']})"
+            row = ManifestRow(
+                f"{one['cls']}/{task.split}/{stem}_{i}",
+                one["cls"],
+                task.split,
+                origin=one["origin"],
+                views=1,
+                valid_points=one["pixels"],
+                status="skipped" if reason else OK,
+                reason=reason,
+                more={key: value for key in COLUMNS if (value := (more | one["more"]).get(key))},
+            )
+            yield row, None if reason else check_cloud(arrays[str(i)], self.points, row.id)
+
+
+def finish_parts(
+    parts: PartFiles,
+    todo: Sequence[tuple[str, Any]],
+    make: Callable[[], Callable[[Any], Part | str]],
+    pool: Pool,
+    label: str,
+    stop: bool,
+) -> dict[str, str]:
+    """Do tasks in a pool of processes, and keep what each gave as a part.
+
+    Args:
+        parts: where they are kept.
+        todo: names of parts, and their tasks.
+        make: called once in each process; gives what does a task, or says in words why it cannot
+            be done.
+        pool: of processes.
+        label: of the progress bar.
+        stop: raise at the first that cannot be done.
+
+    Returns:
+        Why some could not be done, by name.
+
+    Raises:
+        DataError: one could not, with `stop`.
+    """
+    failed = {}
+    with progress_bar(label, total=len(todo)) as advance:
+        for outcome in pool.run(make, todo) if todo else ():
+            result = outcome.result or f"{outcome.name}: {_DIED}"
+            if not isinstance(result, str):
+                parts.write(outcome.name, *result)
+            elif stop:
+                raise DataError(result)
+            else:
+                failed[outcome.name] = result
+            advance()
+    return failed
+
+
+def load_mat(path: Path) -> dict[str, Any]:
+    """The variables of a MATLAB file of version 5 to 7; structs are dicts, cells are lists.
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: damaged, or of another format.
+    """
+    from scipy.io import loadmat
+
+    with reading(path):
+        found: dict[str, Any] = loadmat(path, simplify_cells=True, mat_dtype=False)
+    return found
+
+
+def _worker(dataset: FrameDataset) -> Callable[[FrameTask], Part | str]:
+    """What cuts one frame and thins its objects, in whichever process."""
+    cut = dataset.cutter()
+
+    def work(task: FrameTask) -> Part | str:
+        try:
+            found = cut(task)
+        except DataError as error:
+            return str(error)
+        clouds = {
+            str(i): thinned(one.piece.points_m, dataset.points)
+            for i, one in enumerate(found)
+            if not one.piece.refused
+        }
+        return {"objects": [_note(one) for one in found]}, clouds
+
+    return work
+
+
+def _note(one: Cut) -> dict[str, Any]:
+    piece = one.piece
+    more = {"sub": one.sub}
+    if not piece.refused:
+        more |= {"tier": piece.tier, "why": piece.why, "depth_m": f"{piece.depth_m:.3f}"}
+        more |= {key: f"{getattr(piece, key):.3f}" for key in ("holes", "rim", "occ")}
+    return {
+        "cls": one.cls,
+        "origin": one.origin,
+        "pixels": piece.pixels if piece.refused else len(piece.points_m),
+        "reason": piece.why if piece.refused else "",
+        "more": more,
+    }

@@ -1,0 +1,333 @@
+"""Published formats, read once into the store: what all importers share.
+
+An importer is a frozen dataclass (named by `_target_` in conf/domain) that knows where its files
+are and reads them to clouds and manifest rows. Clouds keep their published scale and order;
+only the axes are turned so that z is up.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
+
+import numpy as np
+from annotated_types import Ge
+from jaxtyping import Float
+
+from qs3.classes import known_as
+from qs3.errors import DataError
+from qs3.store.manifest import SPLITS, ManifestRow
+from qs3.store.meta import MadeOf
+from qs3.store.store import is_begun, is_finished, write_pointset
+from qs3.utils.locks import locked
+from qs3.utils.progress import shown
+from qs3.utils.settings import settings
+
+log = logging.getLogger(__name__)
+
+_SHOWN = 5  # reasons, in the log
+
+UpAxis = Literal["z", "-z", "y", "-y", "x", "-x"]
+UP_AXES: tuple[str, ...] = get_args(UpAxis)
+"""The axes of a file that may point up."""
+
+_TURNS = {
+    "z": ((0, 1, 2), (1, 1, 1)),
+    "-z": ((0, 1, 2), (1, -1, -1)),
+    "y": ((0, 2, 1), (1, -1, 1)),
+    "-y": ((0, 2, 1), (1, 1, -1)),
+    "x": ((2, 1, 0), (-1, 1, 1)),
+    "-x": ((2, 1, 0), (1, 1, -1)),
+}
+"""Axis that points up -> which columns with which signs give x y z with z up: rotations by 90°."""
+
+
+class Item(NamedTuple):
+    """One published cloud before it is read: its row, as far as it is known.
+
+    `where` names it in messages (file, or file and number); `load` gives the raw [n, 3] array or
+    raises DataError. A row that knows its `valid_points` keeps them: the array is of a cloud that
+    was thinned before.
+    """
+
+    row: ManifestRow
+    where: str
+    load: Callable[[], np.ndarray]
+
+
+@settings
+class Importer(abc.ABC):
+    """A published dataset on disk.
+
+    Attributes:
+        folder: where its files are.
+        points: P, the points a cloud has as published. A cloud with fewer is filled up by
+            repeating its points from the first on; the manifest's `valid_points` says how many
+            there were. One with more is an error: it is not the dataset that was meant.
+        on_error: "stop" at a damaged cloud, or "skip" it and say so in the manifest.
+    """
+
+    folder: Path
+    points: Annotated[int, Ge(1)] = 2048
+    on_error: Literal["stop", "skip"] = "stop"
+
+    complete: ClassVar[bool] = True
+    """Whether a class without clouds in a split means that something is wrong."""
+
+    @property
+    def root(self) -> Path:
+        """The folder as an absolute path."""
+        return Path(os.path.expanduser(self.folder)).absolute()
+
+    @abc.abstractmethod
+    def looks_for(self) -> str:
+        """The files it reads, as a pattern with the whole path, for a message."""
+
+    @abc.abstractmethod
+    def is_there(self) -> bool:
+        """Whether there is anything to read; must be fast."""
+
+    @abc.abstractmethod
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """Everything there is, in the dataset's order.
+
+        Raises:
+            DataError: names the file or folder that does not fit the format.
+        """
+
+    def made_of(self) -> MadeOf:
+        """What the store is made of; goes into its meta.yaml."""
+        return MadeOf(objects="published files", published=True)
+
+    def judges(self) -> str:
+        """Which published clouds are for test and should be looked at once; "" of most datasets."""
+        return ""
+
+    def object_of(self, id_: str) -> str:
+        """Which object a cloud shows, where its id tells; else "".
+
+        Clouds of one object are not independent samples: `qs3.report.intervals` takes them
+        together.
+        """
+        return ""
+
+    def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
+        """[P, 3] as published to [P, 3] with z up."""
+        return cloud
+
+    def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
+        """[n, 3] as read to at most P points, for formats that allow more."""
+        return cloud
+
+    def read(
+        self, classes: Sequence[str], work: Path
+    ) -> tuple[list[np.ndarray], list[ManifestRow]]:
+        """Read everything: [P, 3] float32 clouds with z up, and their rows and those skipped.
+
+        Args:
+            classes: the names in label order.
+            work: a folder in which an importer that takes minutes may keep what it has done, to
+                continue after an interruption; it is deleted when the store is finished.
+
+        Raises:
+            DataError: names the file, and the line or item; or a class does not occur in a split,
+                if the dataset is `complete`.
+        """
+        clouds, rows = [], []
+        for row, where, load in shown(self.items(classes), f"importing {self.root.name}"):
+            try:
+                raw = load()
+                cloud = check_cloud(self.thin(raw, where), self.points, where)
+            except DataError as error:
+                if self.on_error == "stop":
+                    raise
+                rows.append(dataclasses.replace(row, status="skipped", reason=str(error)))
+                continue
+            clouds.append(self.turn(cloud, row.cls))
+            measured = len(raw) if row.valid_points is None else row.valid_points
+            rows.append(dataclasses.replace(row, valid_points=measured))
+        _check_complete(rows, classes, self.root, strict=self.complete)
+        report(rows, self.points, self.root)
+        return clouds, rows
+
+    def settings(self) -> dict[str, Any]:
+        """Plain values that decide what `read` gives; kept in the store's meta.yaml."""
+        values = {"format": type(self).__name__, **dataclasses.asdict(self)}
+        plain: dict[str, Any] = json.loads(json.dumps({**values, "folder": str(self.root)}))
+        return plain
+
+
+def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequence[str]) -> None:
+    """Read the published files and put the finished store at `folder`, all or nothing.
+
+    Several processes may ask at once (a sweep): one imports, the others wait and find it done.
+    The store is built next to `folder` and renamed, so a kill leaves nothing at `folder`.
+
+    Raises:
+        DataError: damaged files, or `folder` holds something else.
+    """
+    folder = folder.absolute()
+    building = folder.with_name(f".{folder.name}.importing")
+    with locked(folder.with_name(f".{folder.name}.lock")):
+        if is_finished(folder):
+            return
+        if is_begun(folder):
+            raise DataError(
+                f"{folder} holds a generation that was not finished, and {importer.root} holds "
+                "published files: finish the generation, or delete the folder"
+            )
+        shutil.rmtree(building, ignore_errors=True)
+        work = folder.with_name(f".{folder.name}.parts")
+        settings = importer.settings()
+        clouds, rows = importer.read(classes, work)
+        if importer.settings() != settings:
+            raise DataError(f"files in {importer.root} changed while they were imported")
+        write_pointset(
+            building,
+            name=name,
+            classes=classes,
+            arrays={"points": clouds},
+            rows=rows,
+            meta={"imported": settings, **importer.made_of().meta},
+        )
+        if folder.is_dir():  # holds a lock at most
+            shutil.rmtree(folder)
+        os.rename(building, folder)
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def cloud_id(cls: str, split: str, name: str) -> str:
+    """An id: class, split and name, as far as they are known."""
+    return "/".join(part for part in (cls, split, name) if part)
+
+
+def file_item(
+    path: Path, root: Path, cls: str, split: str, load: Callable[[Path], np.ndarray], name: str = ""
+) -> Item:
+    """The one cloud of a file below `root`; its name is that of the file unless given."""
+    id_ = cloud_id(cls, split, name or path.stem)
+    row = ManifestRow(id_, cls, split, origin=path.relative_to(root).as_posix())
+    return Item(row, str(path), functools.partial(load, path))
+
+
+def unique(items: Iterable[Item]) -> list[Item]:
+    """The items themselves, if their ids differ by more than case: not all systems tell it.
+
+    Raises:
+        DataError: names two files of one id.
+    """
+    found: dict[str, Item] = {}
+    for item in items:
+        other = found.setdefault(item.row.id.casefold(), item)
+        if other is not item:
+            raise DataError(f"{item.where} and {other.where} have one name; rename one")
+    return list(found.values())
+
+
+def by_class(items: Iterable[Item], classes: Sequence[str]) -> list[Item]:
+    """Sorted by split, class (none before all) and id."""
+    label = {name: i for i, name in enumerate(classes)}
+    return sorted(
+        items, key=lambda i: (SPLITS.index(i.row.split), label.get(i.row.cls, -1), i.row.id)
+    )
+
+
+def class_of(name: str, classes: Sequence[str], where: str | Path) -> str:
+    """The class that a name means, in any case (`qs3.classes.ALIASES`); DataError if none."""
+    found = known_as(name, classes)
+    if found is None:
+        raise DataError(f"{where}: unknown class {name!r}; known are {', '.join(classes)}")
+    return found
+
+
+def split_of(name: str, where: str | Path) -> str:
+    """The split that a published name means; DataError if none."""
+    split = "validation" if name.casefold() == "val" else name.casefold()
+    if split not in SPLITS:
+        raise DataError(f"{where}: unknown split {name!r}; known are {', '.join(SPLITS)}")
+    return split
+
+
+def visible(folder: Path) -> list[Path]:
+    """What is in a folder in order of its names, hidden things left out."""
+    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    return [folder / n for n in names if not n.startswith(".") and n != "__MACOSX"]
+
+
+def folders_in(folder: Path) -> Iterator[Path]:
+    """The visible folders in one, in order."""
+    return (path for path in visible(folder) if path.is_dir())
+
+
+def files_in(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
+    """The visible files with one of these extensions, in any case, in order."""
+    return (p for p in visible(folder) if p.suffix.lower() in suffixes and p.is_file())
+
+
+def check_cloud(cloud: np.ndarray, points: int, where: str) -> Float[np.ndarray, "P 3"]:
+    """[P, 3] float32 from [n, 3] with 1 <= n <= P, filled up by repeating from the first point.
+
+    Raises:
+        DataError: wrong shape, no points, more than P, or a value that is not finite.
+    """
+    if cloud.ndim != 2 or cloud.shape[1] != 3 or not 1 <= len(cloud) <= points:
+        raise DataError(f"{where}: shape {cloud.shape}, expected 1 to {points} points x y z")
+    with np.errstate(over="ignore"):  # becomes infinite, and is reported as such
+        cloud = np.asarray(cloud, dtype=np.float32)
+    if not (finite := np.isfinite(cloud).all(axis=1)).all():
+        row = int(np.argmin(finite))
+        raise DataError(f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite")
+    return cloud if len(cloud) == points else cloud[np.arange(points) % len(cloud)]
+
+
+def thinned(cloud: Float[np.ndarray, "n 3"], points: int) -> Float[np.ndarray, "m 3"]:
+    """At most so many points, the farthest from each other, from the first on."""
+    from qs3.geometry.sampling import farthest_point_sampling_np
+
+    if len(cloud) <= points:
+        return cloud
+    return cloud[farthest_point_sampling_np(cloud, points, 0)]
+
+
+def turned(cloud: Float[np.ndarray, "*b 3"], up: str) -> Float[np.ndarray, "*b 3"]:
+    """[..., 3] of which the axis `up` of `UP_AXES` points up, turned by 90 degrees to z up."""
+    columns, signs = _TURNS[up]
+    return cloud[..., columns] * np.array(signs, dtype=cloud.dtype)
+
+
+def _check_complete(
+    rows: Iterable[ManifestRow], classes: Sequence[str], where: Path, *, strict: bool
+) -> None:
+    """Raise DataError (or warn) if a class has no cloud in a split that other classes have."""
+    have = {(row.split, row.cls) for row in rows if row.status == "ok"}
+    if not have:
+        reasons = [row.reason for row in rows][:_SHOWN]
+        raise DataError("\n  ".join([f"{where} holds no clouds that can be read", *reasons]))
+    if not any(cls for _, cls in have):
+        return  # no labels at all
+    for split in sorted({split for split, _ in have}):
+        if empty := [name for name in classes if (split, name) not in have]:
+            problem = f"{where}: split {split!r} has no clouds of {', '.join(empty)}"
+            if strict:
+                raise DataError(problem)
+            log.warning("%s", problem)
+
+
+def report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
+    """Log how many clouds were filled up and how many left out: never silently."""
+    short = sum((row.valid_points or points) < points for row in rows if row.status == "ok")
+    if short:
+        log.warning("%s: clouds under %d points, some repeated: %d", where, points, short)
+    skipped = [row for row in rows if row.status != "ok"]
+    for row in skipped[:_SHOWN]:
+        log.warning("left out: %s", row.reason)
+    if skipped:
+        log.warning("%s: clouds left out: %d; manifest.csv says why", where, len(skipped))

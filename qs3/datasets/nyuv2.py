@@ -1,0 +1,310 @@
+"""NYU Depth V2: objects by instance from the raw depth of its 1,449 labelled frames (Kinect v1).
+
+Silberman, Hoiem, Kohli, Fergus, "Indoor Segmentation and Support Inference from RGBD Images",
+ECCV 2012. `nyu_depth_v2_labeled.mat` is MATLAB's version 7.3, that is HDF5 with all axes in
+reverse order:
+
+    rawDepths     float32 [N, W, H]  metres, projected onto the colour image and not filled in;
+                                     0 where nothing was measured
+    labels        uint16 [N, W, H]   number of the name from 1; 0: not labelled
+    instances     uint8 [N, W, H]    counts the things of one name within a frame from 1
+    names         cells of text      by the numbers of `labels`
+    scenes        cells of text      the room of each frame, e.g. kitchen_0004
+    accelData     float32 [4, N]     readings of the accelerometer, then the tilt
+
+The page calls the columns of `accelData` roll, yaw, pitch and tilt; Kinect's driver gives the
+acceleration along three axes. `vertical.mounting` finds out whether the first three give up.
+
+The raw depth lies in the colour camera's image, so its intrinsics are the colour camera's, from
+camera_params.m of the authors' toolbox (there with pixels counted from 1). Depth is projected to
+rows 45 to 471 and columns 41 to 601 at most (get_projection_mask.m), which is the border that cuts
+an object off. `splits.mat` (MATLAB's version 5) holds trainNdxs and testNdxs, counted from 1.
+
+An object is what carries one number of `instances` under one name; `cut` takes its pixels from
+`rawDepths`, with the sensor's own holes and edges. Things of the names in `with_contents` get what
+lies on them: the authors labelled a bookshelf's books apart from it.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from qs3.datasets.cutting import cut
+from qs3.datasets.depth_images import DepthImage, Pinhole, upright
+from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, load_mat
+from qs3.datasets.vertical import Mounting, angle_deg, floor_up, mounting, planes_up
+from qs3.errors import DataError
+from qs3.store.meta import MadeOf
+from qs3.utils.files import reading
+from qs3.utils.progress import progress_bar
+from qs3.utils.settings import settings
+
+log = logging.getLogger(__name__)
+
+CAMERA = Pinhole(518.857901, 519.469611, 325.582449 - 1, 253.736166 - 1)
+"""The colour camera, whose image the depth lies in; (0, 0) is the first pixel's centre."""
+
+AREA = (44, 471, 40, 601)
+"""Rows from, to and columns from, to of the depth that was projected; of pictures of 640 x 480."""
+
+Vertical = Literal["floor", "accelerometer", "planes"]
+_SIZE = (480, 640)
+_FARTHEST_M = 9.99
+_MOST_MOUNTING_DEG = 5.0  # readings that agree worse with the floors are not used
+_MOST_APART_DEG = 10.0  # a floor farther off its reading is none: a rug on stairs, a mirror
+
+
+class LabelledFrames:
+    """The open .mat; a context manager.
+
+    Attributes:
+        path: of the file.
+        names: by number of label; names[0] is the first name, whose number is 1.
+        scenes: the room of each frame; empty strings if the file does not have them.
+        accelerations: [N, 3] float64 readings; NaN where there are none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file; images are read when they are asked for.
+
+        Raises:
+            MissingDataError: there is no such file.
+            DataError: it is broken off, damaged, or something else.
+        """
+        import h5py
+
+        self.path = path
+        with reading(path):
+            self._file: Any = h5py.File(path, "r")
+            self._n, *self._shape = self._file["rawDepths"].shape
+            self.names, self.scenes = self._words("names"), [""] * self._n
+            self.accelerations = np.full((self._n, 3), np.nan)
+            if "scenes" in self._file:
+                self.scenes = self._words("scenes")
+            if "accelData" in self._file:
+                self.accelerations = np.asarray(self._file["accelData"][:3].T, dtype=np.float64)
+            if {len(self.scenes), len(self.accelerations)} != {self._n}:
+                raise ValueError(f"other numbers of scenes or readings than of {self._n} frames")
+
+    def __enter__(self) -> LabelledFrames:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        """N, the frames."""
+        return int(self._n)
+
+    @property
+    def area(self) -> tuple[int, int, int, int] | None:
+        """Where depth was projected to; None if the pictures have not the published size."""
+        return AREA if tuple(self._shape[::-1]) == _SIZE else None
+
+    def depth_m(self, frame: int) -> Float[np.ndarray, "h w"]:
+        """[h, w] float64, 0 where nothing was measured (the toolbox cuts depths off at 10 m)."""
+        depth = self._read("rawDepths", frame).astype(np.float64)
+        return np.where(depth < _FARTHEST_M, depth, 0)
+
+    def labels(self, frame: int) -> Int[np.ndarray, "h w"]:
+        """[h, w] number of each pixel's name from 1; 0 for none."""
+        return self._read("labels", frame)
+
+    def instances(self, frame: int) -> Int[np.ndarray, "h w"]:
+        """[h, w] which thing of its name a pixel shows, from 1; 0 for none."""
+        return self._read("instances", frame)
+
+    def _read(self, key: str, frame: int) -> np.ndarray:
+        """One image, its axes put right."""
+        with reading(self.path):
+            found: np.ndarray = self._file[key][frame].T
+            return found
+
+    def _words(self, name: str) -> list[str]:
+        """A cell array of text: references to arrays of letters."""
+        cells = (self._file[reference] for reference in self._file[name][...].ravel())
+        # Of an empty text the numbers are its size, 0 by 0.
+        letters = ([] if c.attrs.get("MATLAB_empty", 0) else c[...].ravel(order="F") for c in cells)
+        return ["".join(map(chr, some)) for some in letters]
+
+
+def read_splits(path: Path, frames: int) -> list[str]:
+    """The split of each frame: "train", "test", or "" if it is in neither list.
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: it is damaged, or names a frame that there is not, or one twice.
+    """
+    found = load_mat(path)
+    splits = [""] * frames
+    with reading(path):
+        for name, split in (("trainNdxs", "train"), ("testNdxs", "test")):
+            for number in np.ravel(found[name]).astype(np.int64).tolist():
+                if not 1 <= number <= frames or splits[number - 1]:
+                    raise ValueError(f"{name}: frame {number} of {frames}, or twice")
+                splits[number - 1] = split
+    return splits
+
+
+@settings
+class NYUv2(FrameDataset):
+    """See the module.
+
+    Attributes:
+        file, splits: names of nyu_depth_v2_labeled.mat and splits.mat in the folder.
+        vertical: how up is found, the first way that gives one; see `qs3.datasets.vertical`.
+        with_contents: name -> names of things that belong to it where they lie within its outline.
+        camera: intrinsics in place of the published ones.
+    """
+
+    file: str = "nyu_depth_v2_labeled.mat"
+    splits: str = "splits.mat"
+    vertical: list[Vertical] = field(default_factory=lambda: ["floor", "accelerometer", "planes"])
+    with_contents: dict[str, list[str]] = field(default_factory=dict)
+    camera: Pinhole | None = None
+
+    def files(self) -> Sequence[Path]:
+        """See `FrameDataset`."""
+        return [self.root / self.file, self.root / self.splits]
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects="real objects cut from the raw depth of NYU Depth V2 (Kinect v1)")
+
+    def tasks(self) -> list[FrameTask]:
+        """See `FrameDataset`; finds the vertical of each frame on the way.
+
+        Frames without a vertical are left out, and so are those of neither split.
+        """
+        with LabelledFrames(self.root / self.file) as frames:
+            splits = read_splits(self.root / self.splits, len(frames))
+            ups = self._verticals(frames, splits)
+            if lost := [i + 1 for i, found in ups.items() if found is None]:
+                log.warning("%s: frames without a vertical are left out: %s", frames.path, lost)
+            return [
+                FrameTask(
+                    i + 1,
+                    splits[i],
+                    _room(frames.scenes[i]) or f"block{i // self.block:04d}",
+                    "kinect_v1",
+                    found[0],
+                    upright(found[1]).tolist(),
+                )
+                for i, found in ups.items()
+                if found is not None
+            ]
+
+    def cutter(self) -> Cutter:
+        """See `FrameDataset`."""
+        frames = LabelledFrames(self.root / self.file)
+
+        def cut_frame(task: FrameTask) -> list[Cut]:
+            index = task.number - 1
+            turn = np.array(task.world_from_camera)
+            image = DepthImage(frames.depth_m(index), self.camera or CAMERA, turn, frames.area)
+            labels, instances = frames.labels(index), frames.instances(index)
+            cuts = []
+            for number in np.unique(labels[labels > 0]).tolist():
+                if number > len(frames.names):
+                    raise DataError(f"{frames.path}, frame {task.number}: label without a name")
+                name = frames.names[number - 1]
+                if name not in self.names:
+                    continue
+                same = labels == number
+                for instance in np.unique(instances[same & (instances > 0)]).tolist():
+                    mask = same & (instances == instance)
+                    mask |= self._contents(name, mask, labels, frames.names)
+                    cls = self.names[name]
+                    piece = cut(image, mask, cls, self.rules)
+                    origin = f"{self.file}, frame {task.number}, {name} {instance}"
+                    cuts.append(Cut(cls, name, origin, piece))
+            return cuts
+
+        return cut_frame
+
+    def _contents(
+        self, name: str, mask: np.ndarray, labels: np.ndarray, names: Sequence[str]
+    ) -> Bool[np.ndarray, "h w"]:
+        """[h, w] pixels of what belongs to the thing and lies within its convex outline."""
+        wanted = self.with_contents.get(name, ())
+        numbers = [i + 1 for i, other in enumerate(names) if other in wanted]
+        others = np.isin(labels, numbers)
+        if not others.any():
+            return others
+        hull = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
+        inside = np.zeros(mask.shape, np.uint8)
+        cv2.fillConvexPoly(inside, hull, (1,))
+        return others & (inside == 1)
+
+    def _verticals(
+        self, frames: LabelledFrames, splits: Sequence[str]
+    ) -> dict[int, tuple[str, np.ndarray] | None]:
+        """How the vertical of each frame of a split was found, and up in its camera."""
+        chosen = [i for i, split in enumerate(splits) if split]
+        floors: dict[int, np.ndarray] = {}
+        if {*self.vertical} & {"floor", "accelerometer"}:  # whose mounting the floors give
+            floors = self._floors(frames, chosen)
+        seat = _checked_mounting(frames, floors) if "accelerometer" in self.vertical else None
+        found: dict[int, tuple[str, np.ndarray] | None] = {}
+        for i in chosen:
+            ways = ((way, self._up(way, frames, i, floors, seat)) for way in self.vertical)
+            found[i] = next(((way, up) for way, up in ways if up is not None), None)
+        return found
+
+    def _floors(self, frames: LabelledFrames, chosen: Sequence[int]) -> dict[int, np.ndarray]:
+        if "floor" not in frames.names:
+            return {}
+        number, found = frames.names.index("floor") + 1, {}
+        with progress_bar("looking for floors", total=len(chosen)) as advance:
+            for i in chosen:
+                floor = frames.labels(i) == number
+                camera = self.camera or CAMERA
+                up = floor_up(frames.depth_m(i), camera, floor) if floor.any() else None
+                if up is not None:
+                    found[i] = up
+                advance()
+        return found
+
+    def _up(
+        self,
+        way: str,
+        frames: LabelledFrames,
+        frame: int,
+        floors: Mapping[int, np.ndarray],
+        seat: Mounting | None,
+    ) -> np.ndarray | None:
+        """Up by one way; None if it does not give it."""
+        reading = seat.up(frames.accelerations[frame]) if seat else None
+        if way == "accelerometer":
+            return reading
+        if way == "planes":
+            return planes_up(frames.depth_m(frame), self.camera or CAMERA)
+        up = floors.get(frame)
+        apart = up is not None and reading is not None and angle_deg(up, reading)
+        return None if apart and apart > _MOST_APART_DEG else up
+
+
+def _room(scene: str) -> str:
+    """The room in a scene's name: bookstore_0001d is a recording of bookstore_0001."""
+    return re.sub(r"(?<=\d)[a-z]$", "", re.sub(r"[^\w-]", "-", scene))
+
+
+def _checked_mounting(frames: LabelledFrames, floors: Mapping[int, np.ndarray]) -> Mounting | None:
+    """How the accelerometer sits in the camera, if its readings agree with the floors."""
+    if not floors:
+        return None
+    seat = mounting(frames.accelerations[list(floors)], np.stack(list(floors.values())))
+    if seat is None or seat.error_deg > _MOST_MOUNTING_DEG:
+        log.warning("%s: accelerometer readings do not agree with the floors", frames.path)
+        return None
+    log.info("%s: accelerometer and floors agree within %.1f°", frames.path, seat.error_deg)
+    return seat

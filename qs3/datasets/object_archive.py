@@ -1,0 +1,288 @@
+"""An archive of objects that were cut from depth images, in one .npz: clouds of any size.
+
+    xyz_tenth_mm   [P, 3] int16   points of all objects, in tenths of a millimetre about `centre_m`
+    centre_m       [N, 3] float   z up, the camera at the origin
+    start          [N + 1] int    object i has the points start[i] to start[i + 1]
+    cls            [N] text       class
+    tier           [N] text       "clean" or "hard"
+    img            [N] int        number of the frame it was cut from
+    inlier         [P] bool       optional: false for stray points
+    sub            [N] text       optional: finer name
+    dev            [N] text       optional: which part of a development split it is of
+    pixels         [N] int        optional: pixels with depth that it was cut from
+    rim, occ       [N] float      optional: share of its outline that the picture cuts off, and that
+                                  something nearer covers
+
+Frames in a row show one room: objects of one block of frames are not independent, and a part of the
+archive that judges is blocks away from one that is trained on.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import zipfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from annotated_types import Ge
+from jaxtyping import Float
+
+from qs3.datasets.clouds import read_arrays
+from qs3.datasets.importing import Importer, Item, by_class, class_of, thinned
+from qs3.errors import ConfigError, DataError
+from qs3.store.manifest import ManifestRow
+from qs3.store.meta import MadeOf
+from qs3.utils.settings import settings
+
+log = logging.getLogger(__name__)
+
+TIERS: tuple[str, ...] = ("clean", "hard")
+ADAPT, JUDGE = "adapt", "judge"
+"""Parts of an archive's `dev`: what one trains and chooses on, and what is looked at once."""
+
+_METRES = 1e-4
+_OPTIONAL = ("inlier", "sub", "dev", "pixels", "rim", "occ")
+_REQUIRED = ("xyz_tenth_mm", "centre_m", "start", "cls", "tier", "img")
+
+
+@dataclass(frozen=True, eq=False)
+class Archive:
+    """What the file holds.
+
+    Attributes:
+        path: of the file.
+        cls, sub, tier, dev: [N] text; `sub` is `cls` and `dev` empty where the file has none.
+        frame: [N] number of the frame.
+        pixels, rim, occ: [N]; None where the file has none.
+    """
+
+    path: Path
+    cls: np.ndarray
+    sub: np.ndarray
+    tier: np.ndarray
+    dev: np.ndarray
+    frame: np.ndarray
+    pixels: np.ndarray | None
+    rim: np.ndarray | None
+    occ: np.ndarray | None
+    _tenths: np.ndarray
+    _centre: np.ndarray
+    _start: np.ndarray
+    _inlier: np.ndarray | None
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.cls)
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Objects of each part of `dev`, by name."""
+        return dict(sorted(Counter(self.dev[self.dev != ""].tolist()).items()))
+
+    def of_part(self, part: str) -> list[int]:
+        """Positions of the objects of a part; ConfigError if there are none."""
+        if part not in self.parts:
+            raise ConfigError(f"part={part}: {self.path} has the parts {', '.join(self.parts)}")
+        return np.flatnonzero(self.dev == part).tolist()
+
+    def size(self, index: int) -> int:
+        """Points of an object, stray ones too."""
+        return int(self._start[index + 1] - self._start[index])
+
+    def cloud(self, index: int, inliers_only: bool) -> Float[np.ndarray, "n 3"]:
+        """[n, 3] float32 metres, z up, the camera at the origin."""
+        part = slice(self._start[index], self._start[index + 1])
+        xyz = self._tenths[part] * _METRES + self._centre[index].astype(np.float64)
+        if inliers_only and self._inlier is not None:
+            kept = self._inlier[part]
+            xyz = xyz[kept] if kept.any() else xyz
+        return np.asarray(xyz, dtype=np.float32)
+
+
+@settings
+class ObjectArchive(Importer):
+    """See the module.
+
+    Attributes:
+        file: the .npz, in the folder or by its whole path.
+        train_parts, test_parts: values of `dev` that are for training and for test; others are
+            left out. An archive without `dev` is all for test.
+        fold, folds: instead, `train_parts` alone, cut into `folds` runs of blocks, of which number
+            `fold` (from 0) is for test and the others for training.
+        gap: frames next to a fold's test blocks that are left out of its training part.
+        block: so many frames in a row make a cluster.
+        inliers_only: leave stray points out.
+        tiers: which of "clean" and "hard".
+    """
+
+    file: str = "objects.npz"
+    train_parts: list[str] = field(default_factory=lambda: [ADAPT])
+    test_parts: list[str] = field(default_factory=lambda: [JUDGE])
+    fold: Annotated[int, Ge(0)] | None = None
+    folds: Annotated[int, Ge(2)] = 5
+    gap: Annotated[int, Ge(0)] = 15
+    block: Annotated[int, Ge(1)] = 30
+    inliers_only: bool = True
+    tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: ["clean", "hard"])
+
+    complete: ClassVar[bool] = False
+
+    @property
+    def path(self) -> Path:
+        """Where the .npz lies."""
+        return self.root / Path(self.file).expanduser()
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects=f"real objects cut from depth images, archive {self.path.name}")
+
+    def judges(self) -> str:
+        """See `Importer`."""
+        if self.fold is not None:
+            return ""
+        parts = ", ".join(self.test_parts)
+        return f"part {parts} of {self.path.name} (all of it, if it has no parts)"
+
+    def looks_for(self) -> str:
+        """See `Importer`."""
+        return f"{self.path}   (arrays {', '.join(_REQUIRED)}; published.file=PATH)"
+
+    def is_there(self) -> bool:
+        """See `Importer`."""
+        return self.path.is_file()
+
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """See `Importer`; reads the file. Sorted by split, class and id."""
+        archive = read_archive(self.path)
+        splits = self._splits(archive)
+        found, left = [], Counter[str]()
+        for i in range(len(archive)):
+            where = f"{archive.path}, object {i}"
+            cls = class_of(str(archive.cls[i]), classes, where)
+            split = splits[i]
+            if not split or archive.tier[i] not in self.tiers:
+                left[str(archive.tier[i] if split else archive.dev[i])] += 1
+                continue
+            frame = int(archive.frame[i])
+            name = f"{cluster(frame, self.block)}_{frame:05d}_{i}"
+            more = {"frame": str(frame), "sub": str(archive.sub[i]), "tier": str(archive.tier[i])}
+            origin = f"{self.path.name}[{i}]"
+            row = ManifestRow(f"{cls}/{split}/{name}", cls, split, None, "", origin, 1, more=more)
+            load = functools.partial(archive.cloud, i, self.inliers_only)
+            found.append(Item(row, where, load))
+        if left:
+            log.info("%s: objects left out: %s", self.path, dict(sorted(left.items())))
+        return by_class(found, classes)
+
+    def object_of(self, id_: str) -> str:
+        """See `Importer`: the block of frames."""
+        return id_.rsplit("/", 1)[-1].rsplit("_", 2)[0]
+
+    def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
+        """See `Importer`: at most P points, the farthest."""
+        return thinned(cloud, self.points)
+
+    def settings(self) -> dict[str, Any]:
+        """See `Importer`; the file by what it holds: a copy of it elsewhere is the same archive."""
+        values = super().settings()
+        del values["folder"], values["file"]
+        return {**values, "files": _contents(self.path) if self.path.is_file() else ""}
+
+    def _splits(self, archive: Archive) -> list[str]:
+        """The split of each object; "" for those that are left out.
+
+        Raises:
+            ConfigError: the file has no part of a name that was asked for.
+            DataError: the file has no parts to make folds of.
+        """
+        asked = {*self.train_parts, *self.test_parts}
+        if unknown := sorted(asked - {*archive.parts, ADAPT, JUDGE}):
+            raise ConfigError(
+                f"{self.path} has the parts {', '.join(archive.parts)}, not {', '.join(unknown)}"
+            )
+        if self.fold is None:
+            if not (archive.dev != "").any():
+                return ["test"] * len(archive)
+            split = dict.fromkeys(self.train_parts, "train")
+            split |= dict.fromkeys(self.test_parts, "test")
+            return [split.get(str(part), "") for part in archive.dev]
+        ours, frames = np.isin(archive.dev, self.train_parts), archive.frame
+        blocks = np.unique(frames[ours] // self.block)
+        if len(blocks) < self.folds or self.fold >= self.folds:
+            raise DataError(
+                f"{self.path}: fold {self.fold} of {self.folds}, and {len(blocks)} blocks of "
+                f"frames in {' or '.join(self.train_parts)}"
+            )
+        tested = np.array_split(blocks, self.folds)[self.fold]
+        test = np.isin(frames // self.block, tested) & ours
+        of_test = np.unique(frames[test])
+        near = np.abs(frames[:, None] - of_test[None]).min(axis=1) <= self.gap
+        return np.select([~ours, test, near], ["", "test", ""], "train").tolist()
+
+
+def cluster(frame: int, block: int) -> str:
+    """The block of frames that a frame is of."""
+    return f"block{frame // block:04d}"
+
+
+def read_archive(path: Path) -> Archive:
+    """Read and check the file; nothing in it is unpickled.
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: damaged, an array is missing, or arrays do not fit together.
+    """
+    found = read_arrays(path, _REQUIRED, _OPTIONAL)
+    n, p, start = len(found["cls"]), len(found["xyz_tenth_mm"]), found["start"].astype(np.int64)
+    lengths = {"xyz_tenth_mm": p, "inlier": p, "start": n + 1}
+    odd = [key for key, array in found.items() if len(array) != lengths.get(key, n)]
+    if not n or start[0] != 0 or start[-1] != p or (np.diff(start) < 1).any():
+        odd.append("start")
+    if not np.isfinite(found["centre_m"]).all():
+        odd.append("centre_m")
+    if not {*found["tier"].tolist()} <= {*TIERS}:
+        odd.append("tier")
+    if odd:
+        raise DataError(f"{path}: arrays {odd} do not describe {n} objects of {p} points")
+    return Archive(
+        path,
+        found["cls"],
+        found.get("sub", found["cls"]),
+        found["tier"],
+        found.get("dev", np.full(n, "")),
+        found["img"].astype(np.int64),
+        found.get("pixels"),
+        found.get("rim"),
+        found.get("occ"),
+        found["xyz_tenth_mm"],
+        found["centre_m"],
+        start,
+        found.get("inlier"),
+    )
+
+
+def _contents(path: Path) -> str:
+    """What an .npz holds, by the checksums of its members; nothing is unpacked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = [f"{m.filename} {m.file_size} {m.CRC}\n" for m in archive.infolist()]
+    except zipfile.BadZipFile:
+        return "damaged"
+    return hashlib.sha256("".join(members).encode()).hexdigest()
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a file is an .npz of objects cut from depth images."""
+    if path.suffix.lower() != ".npz":
+        return False
+    try:
+        with zipfile.ZipFile(path) as file:
+            return "xyz_tenth_mm.npy" in file.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False

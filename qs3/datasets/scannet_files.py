@@ -1,0 +1,376 @@
+"""ScanNet's files: recordings, zips of masks, labels, and which scenes there are.
+
+Facts were taken from its public tools (github.com/ScanNet/ScanNet: SensReader, AnnotationTools,
+BenchmarkScripts) and README; PointDA-10's names from github.com/canqin001/PointDAN,
+data_extraction/ScanNet.
+
+`.sens`, format version 4: little endian, without padding: version uint32, sensor name (uint64
+length, bytes), four 4x4 float32 matrices (intrinsics and extrinsics of the colour camera, then of
+the depth camera), colour and depth compression int32, colour width and height, depth width and
+height uint32, depth shift float32 (units a metre), number of frames uint64; each frame:
+camera-to-world 4x4 float32, time stamps of colour and depth uint64, bytes of colour and of depth
+uint64, then those bytes. Frames of an inertial sensor follow; they are not read.
+
+Conventions of SensReader: matrices are row-major; the centre of the top left pixel is at (0, 0); an
+extrinsic matrix takes its camera's coordinates to the base frame of the device (typically the
+colour camera's, whose matrix is then the identity); camera-to-world belongs to the depth camera,
+and a lost frame has -inf everywhere in it. Colour and depth of the published scans are said to be
+aligned already (ScanNet issues 2 and 92); whatever the file holds is used.
+
+`<scene>_2d-instance-filt.zip` holds `instance-filt/<frame>.png` of 8 bits, and
+`<scene>_2d-label-filt.zip` `label-filt/<frame>.png` of 16 bits; frames count from 0 as in the
+`.sens`, and an image has the colour camera's resolution. `<scene>.aggregation.json` lists the
+objects, each with an `objectId` (from 0) and a label in the annotators' words.
+`scannetv2-labels.combined.tsv` maps these words (`raw_category`) to tidied ones (`category`:
+plurals, misspellings and synonyms gone) and to a number (`id`). A pixel of the instance image is
+`objectId` + 1 and one of the label image the `id` of the object's label; 0 is unannotated in both.
+
+PointDA-10 takes the objects whose label is one of ten names, exactly: `NAMES`. So a "bookshelf" is
+none of its shelves and a "sofa" only a couch if the label map says so.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt
+
+from qs3.classes import ALIASES, CLASSES
+from qs3.errors import DataError, MissingDataError
+from qs3.utils.files import reading
+
+log = logging.getLogger(__name__)
+
+NAMES: tuple[str, ...] = (
+    "bathtub", "bed", "shelf", "cabinet", "chair", "lamp", "monitor", "plant", "couch", "table",
+)  # fmt: skip
+"""ScanNet's names of the ten classes, in the order of PointDA-10 (PointDAN's class list)."""
+
+INSTANCES, LABELS = "instance-filt", "label-filt"
+
+_SUFFIXES = {
+    "sens": ".sens",
+    "instances": f"_2d-{INSTANCES}.zip",
+    "labels": f"_2d-{LABELS}.zip",
+    "aggregation": ".aggregation.json",
+}
+_CLASS_OF = {name: ALIASES.get(name, name) for name in NAMES}
+_SCENE = re.compile(r"scene\d{4}_\d{2}")
+_START, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
+_VERSION, _ZLIB = 4, 1
+_RIGID = 1e-2  # of a rotation's entries; stored as float32, they are about 1e-6 off
+
+
+@dataclass(frozen=True, eq=False)
+class SensHeader:
+    """What holds for all frames.
+
+    Attributes:
+        colour_intrinsics, depth_intrinsics: [3, 3] float64, px; last row (0, 0, 1).
+        colour_from_depth: [4, 4] float64 coordinates in the depth camera to those in the colour
+            camera, by their extrinsics.
+        colour_px, depth_px: width and height.
+        packed: depth is compressed by zlib; else raw (both of uint16).
+        depth_shift: depth units a metre.
+        frames: how many there are.
+    """
+
+    colour_intrinsics: Float[np.ndarray, "3 3"]
+    depth_intrinsics: Float[np.ndarray, "3 3"]
+    colour_from_depth: Float[np.ndarray, "4 4"]
+    colour_px: tuple[int, int]
+    depth_px: tuple[int, int]
+    packed: bool
+    depth_shift: float
+    frames: int
+
+
+class SensFile:
+    """An open recording; a context manager.
+
+    Opening it reads the header and, skipping the images, every frame's pose: a broken-off file is
+    found out at once. Images are read when they are asked for, so memory is that of one frame.
+
+    Attributes:
+        header: what holds for all frames.
+        poses: [frames, 4, 4] float64 world_from_depth as stored; see `has_pose`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file; DataError if it is not a recording or broken off."""
+        self.path = path
+        with reading(path), ExitStack() as stack:
+            self._file = stack.enter_context(open(path, "rb"))
+            self.header = self._read_header()
+            self.poses = np.empty((self.header.frames, 4, 4))
+            self._depth_at = []
+            for frame in range(self.header.frames):
+                *pose, _, _, colour, depth = _FRAME.unpack(self._file.read(_FRAME.size))
+                self.poses[frame] = np.reshape(pose, (4, 4))
+                self._depth_at.append((self._file.tell() + colour, depth))
+                self._file.seek(colour + depth, 1)
+            if self._file.tell() > path.stat().st_size:
+                raise ValueError("it is broken off; download it again")
+            stack.pop_all()  # closed by __exit__
+
+    def __enter__(self) -> SensFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self.header.frames
+
+    def has_pose(self, frame: int) -> bool:
+        """Whether the frame's pose is finite and a rigid motion."""
+        return is_rigid(self.poses[frame])
+
+    def depth_m(self, frame: int) -> Float[np.ndarray, "h w"]:
+        """[h, w] float32 depth along the optical axis in metres, 0 where nothing was measured.
+
+        Raises:
+            DataError: the image is damaged.
+        """
+        (offset, length), (width, height) = self._depth_at[frame], self.header.depth_px
+        if length == 0:  # as the format's own tools write a frame without depth
+            return np.zeros((height, width), dtype=np.float32)
+        with reading(f"{self.path}, frame {frame}"):
+            self._file.seek(offset)
+            data = self._file.read(length)
+            data = zlib.decompress(data) if self.header.packed else data
+            raw = np.frombuffer(data, dtype="<u2").reshape(height, width)
+        return raw.astype(np.float32) / np.float32(self.header.depth_shift)
+
+    def _read_header(self) -> SensHeader:
+        version, length = _START.unpack(self._file.read(_START.size))
+        if version != _VERSION:
+            raise ValueError(f"version {version}, only {_VERSION} is known; is it a .sens?")
+        self._file.seek(length, 1)  # the sensor's name
+        values = _HEADER.unpack(self._file.read(_HEADER.size))
+        colour_k, colour, depth_k, depth = np.array(values[:64], np.float64).reshape(4, 4, 4)
+        _, packed, colour_w, colour_h, depth_w, depth_h, shift, frames = values[64:]
+        colour_k, depth_k = colour_k[:3, :3].copy(), depth_k[:3, :3].copy()
+        fits = all(
+            k[0, 0] > 0 and k[1, 1] > 0 and np.isfinite(k).all() for k in (colour_k, depth_k)
+        )
+        if not (fits and is_rigid(colour) and is_rigid(depth) and packed in (0, _ZLIB)):
+            raise ValueError("its matrices are not those of cameras, or its depth is Occipital's")
+        if not 1 <= shift < np.inf:  # 1000: a depth in millimetres
+            raise ValueError(f"a depth shift of {shift} units a metre")
+        return SensHeader(
+            colour_k,
+            depth_k,
+            np.linalg.inv(colour) @ depth,
+            (colour_w, colour_h),
+            (depth_w, depth_h),
+            packed == _ZLIB,
+            shift,
+            frames,
+        )
+
+
+def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether a matrix is finite, a proper rotation, and a shift."""
+    if not np.isfinite(matrix).all():
+        return False
+    rotation = matrix[:3, :3]
+    near = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_RIGID)
+    last_row = np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=_RIGID)
+    return bool(near and last_row and np.linalg.det(rotation) > 0)
+
+
+class MaskArchive:
+    """An open zip of masks, of the folder `INSTANCES` or `LABELS`; a context manager."""
+
+    def __init__(self, path: Path, folder: str) -> None:
+        """Open the zip; DataError if it is damaged, or has no such masks."""
+        self.path = path
+        pattern = re.compile(rf"(?:[\w-]+/)?{re.escape(folder)}/(\d+)\.png")
+        with reading(path):
+            self._zip = zipfile.ZipFile(path)
+            named = [(pattern.fullmatch(name), name) for name in self._zip.namelist()]
+            self._members = {int(match[1]): name for match, name in named if match}
+            if not self._members:
+                raise ValueError(f"it has no {folder}/<frame>.png")
+
+    @property
+    def frames(self) -> frozenset[int]:
+        """The frames that have a mask."""
+        return frozenset(self._members)
+
+    def __enter__(self) -> MaskArchive:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._zip.close()
+
+    def read(self, frame: int) -> UInt[np.ndarray, "h w"]:
+        """[h, w] uint8 or uint16, the mask of a frame; DataError if there is none."""
+        with reading(f"{self.path}, frame {frame}"):
+            data = np.frombuffer(self._zip.read(self._members[frame]), dtype=np.uint8)
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+            if image is None or image.ndim != 2:
+                raise ValueError("not a grey picture")
+        return image
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """A scene's files; those that are not there are None.
+
+    Attributes:
+        scene: its name, e.g. "scene0000_00".
+        split: "train" or "test".
+        sens, instances: the recording and the zip of instance masks; both are needed.
+        aggregation: the list of objects; needed.
+        labels: the zip of label masks, which checks the classes.
+    """
+
+    scene: str
+    split: str
+    sens: Path | None
+    instances: Path | None
+    labels: Path | None
+    aggregation: Path | None
+
+    @staticmethod
+    def find(folder: Path, split: str) -> SceneFiles:
+        """Those in a scene's folder, under ScanNet's names."""
+        paths = {role: folder / f"{folder.name}{suffix}" for role, suffix in _SUFFIXES.items()}
+        there = {role: path if path.is_file() else None for role, path in paths.items()}
+        return SceneFiles(folder.name, split, **there)
+
+    def need(self, role: str) -> Path:
+        """The file of a role, such as "sens"; DataError if it is not there."""
+        path: Path | None = getattr(self, role)
+        if path is None:
+            raise DataError(f"{self.scene}{_SUFFIXES[role]} is not there; download it")
+        return path
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each file, by its role: another size means another file."""
+        paths = {role: getattr(self, role) for role in _SUFFIXES}
+        return {role: path.stat().st_size for role, path in paths.items() if path is not None}
+
+
+def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> list[SceneFiles]:
+    """The scenes in `scans`, one folder each, with the split that the lists of names give them.
+
+    Raises:
+        MissingDataError: there is no scene of the lists.
+        DataError: a scene is in both lists.
+    """
+    if both := sorted(set(train) & set(test)):
+        raise DataError(f"scenes in the lists of train and of test: {', '.join(both[:5])}")
+    split_of = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
+    folders = sorted(path for path in scans.glob("scene*") if path.name in split_of)
+    scenes = [SceneFiles.find(path, split_of[path.name]) for path in folders if path.is_dir()]
+    if not scenes:
+        raise MissingDataError(f"{scans} has no folders like scene0000_00 of the lists")
+    log.info("scenes that are there: %d of the lists' %d", len(scenes), len(split_of))
+    return scenes
+
+
+@dataclass(frozen=True)
+class LabelMap:
+    """The label map, as far as the ten classes need it.
+
+    Attributes:
+        class_of_label: annotator's word to class; words of no class are left out.
+        class_of_id: number in a label mask to class; other numbers are left out.
+    """
+
+    class_of_label: Mapping[str, str]
+    class_of_id: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """An object of one of the ten classes.
+
+    Attributes:
+        object_id: `objectId` of the aggregation; its mask's pixels are this + 1.
+        label: the annotators' word.
+        cls: one of `qs3.classes.CLASSES`.
+    """
+
+    object_id: int
+    label: str
+    cls: str
+
+
+def read_label_map(path: Path, column: str = "category") -> LabelMap:
+    """Read scannetv2-labels.combined.tsv (or ScanNet v1's, whose `category` is the raw word).
+
+    `column` has the words that are compared with `NAMES`: "category" (tidied) or "raw_category".
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: it has other columns, or lacks one of the ten classes.
+    """
+    by_label, by_id = {}, {}
+    with reading(path):
+        rows = csv.DictReader(
+            path.read_text(errors="replace").splitlines(), delimiter="\t", quoting=csv.QUOTE_NONE
+        )
+        raw = "raw_category" if "raw_category" in (rows.fieldnames or []) else "category"
+        for row in rows:
+            if cls := _CLASS_OF.get(row[column].strip()):
+                by_label[row[raw].strip()] = cls
+                by_id[int(row["id"])] = cls
+        if absent := sorted(set(CLASSES) - set(by_label.values())):
+            raise ValueError(f"no label of the classes {', '.join(absent)} in {column!r}")
+    return LabelMap(by_label, by_id)
+
+
+def read_objects(path: Path, label_map: LabelMap) -> tuple[list[Labelled], list[str]]:
+    """The objects of the ten classes in an aggregation.json, by `objectId`, and what is odd.
+
+    Odd is the same `objectId` under labels of different classes; such an object is left out.
+
+    Raises:
+        DataError: it is not an aggregation.
+    """
+    with reading(path):
+        groups = json.loads(path.read_text())["segGroups"]
+        named = [(int(group["objectId"]), group["label"].strip()) for group in groups]
+    found: dict[int, tuple[str, str | None]] = {}
+    torn = set()
+    for number, label in named:
+        cls = label_map.class_of_label.get(label)
+        if found.setdefault(number, (label, cls))[1] != cls:
+            torn.add(number)
+    objects = [
+        Labelled(number, label, cls)
+        for number, (label, cls) in sorted(found.items())
+        if cls is not None and number not in torn
+    ]
+    return objects, [f"objectId {number} has labels of two classes" for number in sorted(torn)]
+
+
+def read_scene_list(path: Path) -> list[str]:
+    """The scenes of scannetv2_train.txt or scannetv2_val.txt, one a line.
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: a line is not a scene's name, or there are none.
+    """
+    with reading(path):
+        scenes = path.read_text().split()
+        if not scenes or not all(map(_SCENE.fullmatch, scenes)):
+            raise ValueError("a line should be like scene0000_00")
+    return scenes

@@ -1,0 +1,242 @@
+"""SUN RGB-D: objects by oriented box, less the floor, from the raw depth of four sensors.
+
+Song, Lichtenberg, Xiao, "SUN RGB-D: A RGB-D Scene Understanding Benchmark Suite", CVPR 2015.
+
+    SUNRGBDMeta3DBB_v2.mat             version 5; SUNRGBDMeta: a struct a frame, with
+        depthpath, sensorType (kv1, kv2, xtion, realsense), K [3, 3], Rtilt [3, 3]
+        groundtruth3DBB: structs with classname, basis [3, 3] (rows are the axes), coeffs [3] (half
+                         the sizes, perhaps negative) and centroid [3], in metres
+    SUNRGBDtoolbox/traintestSUNRGBD/allsplit.mat    alltrain, alltest: folders of the frames
+    SUNRGBD/<sensor>/.../<frame>/depth/*.png        raw depth; depth_bfx/ has it filled in
+
+Paths in the tables begin with a folder of the authors' machine; what follows its SUNRGBD/ counts.
+`depthpath` is that of the filled depth: the raw one is the only PNG in the folder depth next to it
+(its name may differ).
+
+A depth pixel is a millimetre with its 16 bits rotated to the left by three. K counts pixels from 1.
+The toolbox turns a pixel's point to (x, depth, -y), and Rtilt takes that to a frame with z up, in
+which the boxes are; the camera is its origin.
+
+What lies in an object's box and is not its floor is cut. A box is not a mask: a chair under a table
+lies in the table's box, too, and what stands on a table is cut with it. Nor can it have holes: that
+column of the manifest is 0.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from qs3.datasets.cutting import Box, Piece, box_mask, cut
+from qs3.datasets.depth_images import DepthImage, Pinhole
+from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, load_mat
+from qs3.store.meta import MadeOf
+from qs3.utils.files import reading
+from qs3.utils.settings import settings
+
+log = logging.getLogger(__name__)
+
+META = "SUNRGBDMeta3DBB_v2.mat"
+SPLITS = "SUNRGBDtoolbox/traintestSUNRGBD/allsplit.mat"
+Sensor = Literal["kv1", "kv2", "xtion", "realsense"]
+SENSORS: tuple[Sensor, ...] = get_args(Sensor)
+
+_ROOT = "SUNRGBD"
+_SUN3D = "sun3ddata"  # its folders are rooms; those of the other parts are single frames
+_NAMED = 12  # other names that the log shows
+_SWAPPED = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""(x, y, z) of the camera to the toolbox's (x, z, -y)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledBox:
+    """One box of a frame: the authors' word for it, and the box in the frame with z up.
+
+    The box is None if its numbers are not those of a box: people drew thousands.
+    """
+
+    name: str
+    box: Box | None
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One entry of the table.
+
+    Attributes:
+        number: in the table, from 1.
+        sensor: one of `SENSORS`.
+        folder: of the frame, relative to the archive, e.g. "SUNRGBD/kv2/align_kv2/2014...".
+        camera: of the depth image.
+        world_from_camera: [3, 3] rotation to z up.
+        boxes: things in it.
+    """
+
+    number: int
+    sensor: str
+    folder: PurePosixPath
+    camera: Pinhole
+    world_from_camera: Float[np.ndarray, "3 3"]
+    boxes: tuple[LabelledBox, ...]
+
+
+def read_frames(root: Path) -> list[Frame]:
+    """All entries of the table of boxes.
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: it is damaged, or not this table.
+    """
+    path = root / META
+    found = load_mat(path)
+    with reading(path):
+        entries = _listed(found["SUNRGBDMeta"])
+        return [_frame(entry, number) for number, entry in enumerate(entries, start=1)]
+
+
+def read_splits(root: Path, splits: str = SPLITS) -> dict[PurePosixPath, str]:
+    """The split of each frame, by its folder: "train" or "test".
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: it is damaged.
+    """
+    path = root / splits
+    found = load_mat(path)
+    with reading(path):
+        sides = (("alltrain", "train"), ("alltest", "test"))
+        return {_inner(words): split for name, split in sides for words in _listed(found[name])}
+
+
+def open_image(root: Path, frame: Frame) -> DepthImage:
+    """The raw depth of a frame; DataError if it is not there, damaged, or more than one."""
+    folder = root / Path(*frame.folder.parts) / "depth"
+    with reading(folder):
+        (path,) = folder.glob("*.png")
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        return DepthImage(millimetres(pixels) / 1000.0, frame.camera, frame.world_from_camera)
+
+
+def millimetres(rotated: np.ndarray | None) -> Float[np.ndarray, "h w"]:
+    """[h, w] float64 depth in millimetres from pixels of 16 bits that were rotated."""
+    if rotated is None or rotated.dtype != np.uint16:
+        raise ValueError("not a picture of 16 bits")
+    return ((rotated >> np.uint16(3)) | (rotated << np.uint16(13))).astype(np.float64)
+
+
+@settings
+class SUNRGBD(FrameDataset):
+    """See the module.
+
+    Attributes:
+        sensors: whose frames are cut.
+        splits: allsplit.mat, relative to the folder.
+    """
+
+    sensors: list[Sensor] = field(default_factory=lambda: list(SENSORS))
+    splits: str = SPLITS
+
+    def files(self) -> Sequence[Path]:
+        """See `FrameDataset`."""
+        return [self.root / META, self.root / self.splits]
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects="real objects cut by their boxes from the raw depth of SUN RGB-D")
+
+    def tasks(self) -> list[FrameTask]:
+        """See `FrameDataset`; frames of the chosen sensors that are of a split."""
+        splits = read_splits(self.root, self.splits)
+        frames = [one for one in read_frames(self.root) if one.sensor in self.sensors]
+        known = [one for one in frames if one.folder in splits]
+        log.info("%s: frames in neither split: %d", self.root, len(frames) - len(known))
+        others = Counter(b.name for one in known for b in one.boxes if b.name not in self.names)
+        log.info("boxes of other names are left out: %s", others.most_common(_NAMED))
+        return [
+            FrameTask(
+                one.number, splits[one.folder], _cluster(one, self.block), one.sensor, "published"
+            )
+            for one in known
+        ]
+
+    def cutter(self) -> Cutter:
+        """See `FrameDataset`."""
+        frames = {one.number: one for one in read_frames(self.root)}
+
+        def cut_frame(task: FrameTask) -> list[Cut]:
+            frame = frames[task.number]
+            wanted = [box for box in frame.boxes if box.name in self.names]
+            if not wanted:
+                return []
+            image = open_image(self.root, frame)
+            cuts = []
+            for number, one in enumerate(wanted, start=1):
+                cls = self.names[one.name]
+                if one.box is None:
+                    nothing = np.zeros((0, 3), np.float32)
+                    why = "its numbers are not those of a box"
+                    piece = Piece(nothing, np.zeros(0, bool), 0, 1.0, why=why, refused=True)
+                else:
+                    mask = box_mask(image, one.box, self.rules)
+                    piece = cut(image, mask, cls, self.rules, edge_px=0)
+                cuts.append(Cut(cls, one.name, f"{frame.folder}, {one.name} {number}", piece))
+            return cuts
+
+        return cut_frame
+
+
+def _cluster(frame: Frame, block: int) -> str:
+    """The room of a frame of SUN3D; else the block of frames in a row that it is one of."""
+    parts = frame.folder.parts
+    if _SUN3D in parts[:-1]:
+        room = "-".join(parts[parts.index(_SUN3D) + 1 : -1]) or parts[-1]
+        return f"{frame.sensor}_{room}"
+    return f"{frame.sensor}_block{frame.number // block:05d}"
+
+
+def _listed(value: Any) -> list[Any]:
+    """A struct array or cell array as a list: one element comes alone, none as an empty array."""
+    return list(np.ravel(value)) if isinstance(value, np.ndarray | list) else [value]
+
+
+def _frame(entry: dict[str, Any], number: int) -> Frame:
+    k = np.asarray(entry["K"], np.float64).reshape(3, 3)
+    tilt = np.asarray(entry["Rtilt"], np.float64).reshape(3, 3)
+    boxes = [one for one in _listed(entry.get("groundtruth3DBB", [])) if isinstance(one, dict)]
+    return Frame(
+        number,
+        str(entry["sensorType"]),
+        _inner(entry["depthpath"]).parent.parent,
+        Pinhole(k[0, 0], k[1, 1], k[0, 2] - 1, k[1, 2] - 1),
+        tilt @ _SWAPPED,
+        tuple(map(_box, boxes)),
+    )
+
+
+def _box(entry: dict[str, Any]) -> LabelledBox:
+    """One of thousands that people drew: one that is not a box costs only itself."""
+    name = str(entry.get("classname", ""))
+    try:
+        axes = np.asarray(entry["basis"], np.float64).reshape(3, 3)
+        half = np.abs(np.asarray(entry["coeffs"], np.float64)).reshape(3)
+        centre = np.asarray(entry["centroid"], np.float64).reshape(3)
+    except (KeyError, TypeError, ValueError):
+        return LabelledBox(name, None)
+    whole = np.isfinite([*axes.ravel(), *half, *centre]).all()
+    if not whole or not np.allclose(axes @ axes.T, np.eye(3), atol=0.05):
+        return LabelledBox(name, None)
+    return LabelledBox(name, Box(centre, axes, half))
+
+
+def _inner(words: Any) -> PurePosixPath:
+    """What follows SUNRGBD/ in a path of the authors' machine, with it."""
+    parts = str(words).split("/")
+    return PurePosixPath(*parts[parts.index(_ROOT) :])

@@ -1,0 +1,209 @@
+"""What is cut equals what was placed: the core on single images whose every surface is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from qs3.classes import CLASSES
+from qs3.datasets.cutting import Box, box_mask, cut
+from qs3.datasets.depth_images import DepthImage, Pinhole, upright
+from qs3.datasets.domain import compose_domain
+from qs3.datasets.nyuv2 import AREA
+from qs3.datasets.regions import Limits, Rules, body, occlusion, pieces, rim
+from qs3.errors import DataError
+from tests.fixtures.frame_files import Shot, Thing, kinect
+
+STEP_M = 0.06  # half a step of a Kinect's disparity and four sigma of noise at 3.5 m
+
+
+def seen(shot, noisy=True):
+    """The image of a shot, and what each pixel shows."""
+    depth, shown = shot.render()
+    depth = kinect(depth, 1) if noisy else depth
+    return DepthImage(depth, Pinhole(*shot.camera), upright(shot.up_in_camera)), shown
+
+
+def test_points_lie_on_the_things_and_stand_upright(shots, rules):
+    for shot in shots[:5]:
+        image, shown = seen(shot)
+        for index, thing in enumerate(shot.things):
+            if thing.name == "toy":
+                continue
+            piece = cut(image, shown == index, "default", rules)
+            if piece.refused:
+                continue
+            where = shot.to_world(piece.points_m.astype(float))
+            assert thing.distance(where).max() < STEP_M, thing
+            assert where[:, 2].min() > thing.z - STEP_M
+            top = thing.z + (thing.parts[:, 2] + thing.parts[:, 5] / 2).max()
+            assert abs(where[:, 2].max() - top) < STEP_M, thing
+
+
+def test_without_noise_points_are_exact(shots, rules):
+    image, shown = seen(shots[0], noisy=False)
+    piece = cut(image, shown == 0, "chair", rules)
+    assert shots[0].things[0].distance(shots[0].to_world(piece.points_m)).max() < 1e-5
+    assert piece.holes == 0
+    assert piece.pixels == len(piece.points_m) > 0.8 * (shown == 0).sum()
+
+
+def test_a_mask_that_bleeds_takes_nothing_from_behind(shots, rules):
+    """Labels that are three pixels too large on all sides show wall and floor as well."""
+    import cv2
+
+    shot = shots[0]
+    image, shown = seen(shot)
+    wide = cv2.dilate((shown == 0).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    piece = cut(image, wide, "chair", rules)
+    off = shot.things[0].distance(shot.to_world(piece.points_m))
+    assert (off > 0.15).mean() < 0.02  # the floor that touches its feet
+    assert piece.kept < 1
+
+
+def test_covered_and_cut_off(shots, rules):
+    image, shown = seen(shots[1])
+    sofa = cut(image, shown == 0, "sofa", rules)
+    assert (sofa.tier, sofa.refused) == ("hard", False)
+    assert "covered" in sofa.why
+    assert 0.1 < sofa.occ < 0.5
+    assert sofa.rim == 0
+    toy = cut(image, shown == 1, "default", rules)
+    assert toy.occ < 0.02  # what covers is not covered
+    image, shown = seen(shots[2])
+    image = dataclasses.replace(image, area=AREA)
+    left, right = (cut(image, shown == index, "chair", rules) for index in (0, 1))
+    assert right.refused
+    assert "cut off by the picture" in right.why or "pixels" in right.why
+    assert (left.refused, left.tier) == (False, "hard")
+    assert "cut off" in left.why
+    image, shown = seen(shots[0])
+    clean = cut(image, shown == 0, "chair", rules)
+    assert (clean.tier, clean.why, clean.rim) == ("clean", "", 0)
+    assert clean.occ < 0.05
+
+
+def test_an_arm_before_its_seat_is_joined_and_a_wall_behind_is_not(rules):
+    depth = np.full((80, 120), 3.0)
+    depth[20:60, 20:60] = 2.0  # a seat
+    depth[20:60, 60:70] = 1.93  # an arm, 7 cm nearer: a jump, but near in space
+    mask = np.zeros(depth.shape, bool)
+    mask[20:60, 20:90] = True  # and twenty columns of wall
+    image = DepthImage(depth, Pinhole(500, 500, 60, 40), np.array(LEVEL))
+    kept = body(pieces(mask, depth, rules), image.points_m, rules)
+    np.testing.assert_array_equal(kept, mask & (depth < 2.5))
+    piece = cut(image, mask, "default", dataclasses.replace(rules, erode_px=0))
+    assert piece.kept == pytest.approx(50 / 70)
+
+
+LEVEL = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+
+
+def test_a_hole_is_bridged_up_to_its_width(rules):
+    depth = np.full((10, 60), 2.0)
+    depth[:, 30:38] = 0
+    measured = depth > 0
+    assert pieces(measured, depth, rules).max() == 0
+    depth[:, 38] = 0
+    assert pieces(depth > 0, depth, rules).max() == 1
+
+
+def test_rim_counts_the_outline_at_the_border():
+    rules = Rules(border_px=1)
+    inside = np.ones((20, 30), bool)
+    mask = np.zeros((20, 30), bool)
+    mask[0:10, 5:15] = True  # ten of 36 outline pixels lie in the first row
+    assert rim(mask, inside, rules) == pytest.approx(10 / 36)
+    inside[:5] = False
+    moved = np.roll(mask, 5, axis=0)
+    assert rim(moved, inside, rules) == pytest.approx(10 / 36)
+    assert rim(np.roll(mask, 8, axis=0), np.ones_like(mask), rules) == 0
+
+
+def test_occlusion_counts_the_outline_beside_something_nearer(rules):
+    depth = np.full((40, 40), 3.0)
+    mask = np.zeros((40, 40), bool)
+    mask[10:30, 10:30] = True
+    depth[mask] = 2.0
+    depth[:, 30:] = 1.0  # all along its right side
+    one = dataclasses.replace(rules, reach_px=1)
+    assert occlusion(mask, mask, depth, one) == pytest.approx(20 / 76)
+    depth[:, 30:] = 1.97  # no more than a jump
+    assert occlusion(mask, mask, depth, one) == 0
+
+
+def test_a_box_less_the_floor(shots, rules):
+    for shot in shots[:5]:
+        image, _ = seen(shot)
+        for thing in shot.things:
+            centre, axes, half = thing.box()
+            box = Box(centre - shot.eye, axes, half)
+            mask = box_mask(image, box, rules)
+            where = shot.to_world(image.points_m[mask])
+            assert where[:, 2].min() > 0.02  # nothing of the floor
+            others = [one for one in shot.things if one is not thing]
+            off = np.min([one.distance(where) for one in (thing, *others)], axis=0)
+            assert np.quantile(off, 0.99) < STEP_M
+            whole = np.isin(seen(shot)[1], [shot.things.index(thing)]) & (image.depth_m > 0)
+            high = whole & (image.points_m[..., 2] + shot.height_m > 0.08)
+            assert (mask & high).sum() > 0.9 * high.sum()  # noise leaves a thin box
+
+
+def test_refusals_say_why(rules):
+    shot = Shot([Thing("chair", 0, 2.4, 35)])
+    image, shown = seen(shot)
+    mask = shown == 0
+    few = dataclasses.replace(rules, limits={"chair": Limits(pixels=10**6)})
+    assert "fewer than 1000000" in cut(image, mask, "chair", few).why
+    small = dataclasses.replace(rules, limits={"chair": Limits(1, 2.0, 3.0)})
+    assert "m, not 2 to 3 m" in cut(image, mask, "chair", small).why
+    blind = DepthImage(
+        np.where(np.random.default_rng(0).random(mask.shape) < 0.7, 0, image.depth_m),
+        image.camera, image.world_from_camera,
+    )  # fmt: skip
+    assert "without depth" in cut(blind, mask, "chair", rules).why
+    nothing = cut(image, np.zeros_like(mask), "chair", rules)
+    assert (nothing.refused, nothing.pixels) == (True, 0)
+
+
+def test_flat_is_hard_unless_the_class_is(rules):
+    plate = Thing("toy", 0, 2.5, boxes=((0, 0, 0.5, 0.6, 0.01, 0.6),))
+    image, shown = seen(Shot([plate]), noisy=False)
+    assert cut(image, shown == 0, "cabinet", rules).why == "flat"
+    assert cut(image, shown == 0, "monitor", rules).tier == "clean"
+
+
+def test_outliers_are_flagged_or_dropped(rules):
+    image, shown = seen(Shot([Thing("chair", 0, 2.4, 35)]))
+    kept = cut(image, shown == 0, "chair", rules)
+    dropped = cut(image, shown == 0, "chair", dataclasses.replace(rules, drop_outliers=True))
+    assert 0.9 < kept.inlier.mean() < 1
+    np.testing.assert_array_equal(dropped.points_m, kept.points_m[kept.inlier])
+    assert dropped.pixels == kept.pixels
+
+
+def test_the_defaults_are_those_of_the_config(rules):
+    assert dataclasses.replace(rules, limits={}) == Rules()
+    assert rules.limits_of("anything") == Limits()
+    assert set(rules.limits) == {"default", *CLASSES}
+
+
+def test_wrong_rules_and_images():
+    given = compose_domain("nyuv2", {}).importer()
+    own = dataclasses.replace(given, names={"cup": "mug"}, rules={"limits": {"mug": {"pixels": 5}}})
+    assert own.rules.limits_of("mug") == Limits(pixels=5)
+    for wrong in ({"near_m": -1.0}, {"nonsense": 1}, {"limits": {"chair": {"pixels": 0}}}):
+        with pytest.raises(ValueError, match="validation error"):
+            Rules.of(wrong)
+    with pytest.raises(ValueError, match="greater than 0"):
+        Pinhole(0, 1, 0, 0)
+    with pytest.raises(DataError):
+        DepthImage(np.ones((4, 4)), Pinhole(1, 1, 0, 0), np.eye(3) * 2)
+
+
+def test_a_camera_that_looks_straight_down_or_up_is_the_limit_of_one_that_nearly_does():
+    for z in (-1.0, 1.0):
+        exact = upright(np.array([0, 0, z]))
+        np.testing.assert_allclose(exact, upright(np.array([0, -1e-5, z])), atol=1e-4)
+        np.testing.assert_allclose(exact @ exact.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(exact) > 0

@@ -1,0 +1,329 @@
+"""Published formats: known answers, then every kind of damage we could think of."""
+
+import os
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from qs3.datasets.arrays import NamedArrays, PointDAH5
+from qs3.datasets.domain import Domain
+from qs3.datasets.folders import GraspNetPC, PublishedTree
+from qs3.datasets.importing import check_cloud, import_into
+from qs3.errors import DataError
+from qs3.store.store import (
+    ManifestRow,
+    is_finished,
+    open_pointset,
+    read_manifest,
+    write_pointset,
+)
+from qs3.training.load import _objects_by_id
+from tests.datasets.test_domain import domain
+from tests.fixtures import published as fixtures
+
+SPLITS = {"train": 2, "test": 1}
+TWO = ("bed", "chair")
+
+
+def xyz_tree(root, names=("a", "b"), classes=TWO, splits=("train", "test"), rows=4):
+    for c, cls in enumerate(classes):
+        for s, split in enumerate(splits):
+            (root / cls / split).mkdir(parents=True, exist_ok=True)
+            for n, name in enumerate(names):
+                cloud = 100 * c + 10 * s + n + np.arange(rows * 3).reshape(-1, 3)
+                np.savetxt(root / cls / split / f"{name}.xyz", cloud)
+    return root
+
+
+def test_order_ids_and_coordinates(tmp_path):
+    importer = PublishedTree(xyz_tree(tmp_path), points=4)
+    assert importer.is_there()
+    clouds, rows = importer.read(TWO, tmp_path)
+    assert [row.id for row in rows] == [
+        "bed/train/a", "bed/train/b", "chair/train/a", "chair/train/b",
+        "bed/test/a", "bed/test/b", "chair/test/a", "chair/test/b",
+    ]  # fmt: skip
+    assert [cloud[0, 0] for cloud in clouds] == [0, 1, 100, 101, 10, 11, 110, 111]
+    assert clouds[0].tolist() == np.arange(12).reshape(4, 3).tolist()
+    assert clouds[0].dtype == np.float32
+    assert rows[0].origin == os.path.join("bed", "train", "a.xyz")
+    assert {row.valid_points for row in rows} == {4}
+
+
+def test_few_points_are_repeated_and_counted(tmp_path, caplog):
+    clouds, rows = PublishedTree(xyz_tree(tmp_path), points=10).read(TWO, tmp_path)
+    np.testing.assert_array_equal(clouds[0], np.resize(np.arange(12), (10, 3)))
+    assert {row.valid_points for row in rows} == {4}
+    assert "under 10 points" in caplog.text
+
+
+def test_names_of_classes_and_splits(tmp_path):
+    xyz_tree(tmp_path, classes=("Night_Stand", "COUCH"), splits=("train", "val"))
+    _, rows = PublishedTree(tmp_path, points=4).read(("cabinet", "sofa"), tmp_path)
+    assert {row.cls for row in rows} == {"cabinet", "sofa"}
+    assert {row.split for row in rows} == {"train", "validation"}
+
+
+def test_an_empty_class_is_an_error(tmp_path):
+    xyz_tree(tmp_path)
+    for path in (tmp_path / "chair" / "test").iterdir():
+        path.unlink()
+    (tmp_path / "chair" / "test" / "readme.txt").write_text("moved")
+    with pytest.raises(DataError):
+        PublishedTree(tmp_path, points=4).read(TWO, tmp_path)
+    with pytest.raises(DataError):
+        PublishedTree(tmp_path / "chair" / "test", points=4).read(TWO, tmp_path)
+
+
+def test_hidden_files_are_passed_over(tmp_path):
+    xyz_tree(tmp_path)
+    (tmp_path / "__MACOSX" / "train").mkdir(parents=True)
+    (tmp_path / ".git").mkdir()
+    (tmp_path / "bed" / ".DS_Store").write_text("")
+    (tmp_path / "bed" / "train" / "._a.xyz").write_bytes(b"\0")
+    (tmp_path / "README").write_text("")
+    assert len(PublishedTree(tmp_path, points=4).read(TWO, tmp_path)[0]) == 8
+
+
+def test_npy_axes(tmp_path):
+    cloud = np.array([[1, 2, 3], [4, 5, 6]], "f4")
+    for cls in ("chair", "plant"):
+        (tmp_path / cls / "train").mkdir(parents=True)
+        np.save(tmp_path / cls / "train" / "x.npy", cloud)
+    importer = PublishedTree(tmp_path, points=2, up="y", up_z_classes=["plant"])
+    (chair, plant), _ = importer.read(("chair", "plant"), tmp_path)
+    assert chair.tolist() == [[1, -3, 2], [4, -6, 5]]  # y is up in the file
+    assert plant.tolist() == cloud.tolist()
+
+
+def h5_file(path, n=2, points=4, **changes):
+    content = {
+        "data": np.arange(n * points * 6, dtype="f4").reshape(n, points, 6),
+        "label": np.arange(n, dtype="i4")[:, None],
+        **changes,
+    }
+    with h5py.File(path, "w") as file:
+        for key, value in content.items():
+            if value is not None:
+                file[key] = value
+
+
+def h5_folder(folder, **changes):
+    folder.mkdir(exist_ok=True)
+    for name in ("train_0", "train_1", "test_0"):
+        h5_file(folder / f"{name}.h5", **changes)
+    return folder
+
+
+def test_h5_axes_and_mirror(tmp_path):
+    h5_folder(tmp_path)
+    (tmp_path / "test_0.h5").rename(tmp_path / "test_1.h5")
+    assert PointDAH5(tmp_path).is_there()
+    (tmp_path / "test_1.h5").rename(tmp_path / "away")
+    assert not PointDAH5(tmp_path).is_there()  # both splits are needed
+    (tmp_path / "away").rename(tmp_path / "test_0.h5")
+    clouds, rows = PointDAH5(tmp_path, points=4, undo_mirror=False).read(TWO, tmp_path)
+    assert clouds[0][:2].tolist() == [[0, -2, 1], [6, -8, 7]]  # (x, y, z) -> (x, -z, y)
+    clouds, rows = PointDAH5(tmp_path, points=4).read(TWO, tmp_path)
+    assert clouds[0][:2].tolist() == [[0, 2, 1], [6, 8, 7]]
+    assert [row.id for row in rows] == [
+        "bed/train/train_0_0000", "chair/train/train_0_0001",
+        "bed/train/train_1_0000", "chair/train/train_1_0001",
+        "bed/test/test_0_0000", "chair/test/test_0_0001",
+    ]  # fmt: skip
+    assert rows[3].origin == "train_1.h5[1]"
+
+
+def npz(folder, **changes):
+    content = {
+        "points": np.arange(4 * 2 * 3, dtype="f4").reshape(4, 2, 3),
+        "cls": np.array(["bed", "chair", "bed", "chair"]),
+        "split": np.array(["test", "train", "train", "test"]),
+        "name": np.array(["a", "b", "c", "d"]),
+        **changes,
+    }
+    np.savez(folder / "points.npz", **{k: v for k, v in content.items() if v is not None})
+    return folder
+
+
+def test_named_arrays(tmp_path):
+    clouds, rows = NamedArrays(npz(tmp_path), points=2).read(TWO, tmp_path)
+    assert [r.id for r in rows] == ["bed/train/c", "chair/train/b", "bed/test/a", "chair/test/d"]
+    assert [cloud[0, 0] for cloud in clouds] == [12, 6, 0, 18]
+
+
+def test_import_is_all_or_nothing(tmp_path):
+    xyz_tree(tmp_path / "p")
+    bad = tmp_path / "p" / "bed" / "test" / "a.xyz"
+    good = bad.read_text()
+    bad.write_text("1 2\n")
+    importer = PublishedTree(tmp_path / "p", points=4)
+    with pytest.raises(DataError):
+        import_into(tmp_path / "s", importer, name="s", classes=TWO)
+    assert not (tmp_path / "s").exists()
+    bad.write_text(good)
+    (tmp_path / ".s.importing").mkdir()  # what a kill would leave
+    (tmp_path / ".s.importing" / "points.npy").write_text("half")
+    import_into(tmp_path / "s", importer, name="s", classes=TWO)
+    assert sorted(p.name for p in (tmp_path / "s").iterdir()) == [
+        "manifest.csv", "meta.yaml", "points.npy",
+    ]  # fmt: skip
+    assert not (tmp_path / ".s.importing").exists()
+    before = (tmp_path / "s" / "meta.yaml").stat().st_ino
+    import_into(tmp_path / "s", importer, name="s", classes=TWO)  # once is enough
+    assert (tmp_path / "s" / "meta.yaml").stat().st_ino == before
+
+
+def test_folders_that_are_in_the_way(tmp_path):
+    importer, folder = PublishedTree(xyz_tree(tmp_path / "p"), points=4), tmp_path / "s"
+    folder.mkdir()
+    (folder / "part.npz").write_text("")
+    with pytest.raises(DataError):
+        import_into(folder, importer, name="s", classes=TWO)
+    (folder / "part.npz").rename(folder / ".lock")  # of a generation that was refused at once
+    import_into(folder, importer, name="s", classes=TWO)
+    assert len(open_pointset(folder)) == 8
+
+
+@pytest.mark.slow
+def test_kill_9_during_an_import(tmp_path):
+    """Whenever the import is killed, there is no store or a whole one; then it is made."""
+    xyz_tree(tmp_path / "p", names=[f"{i:02d}" for i in range(60)], rows=200)
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from qs3.datasets.folders import PublishedTree\n"
+        "from qs3.datasets.importing import import_into\n"
+        "print('go', flush=True)\n"
+        "import_into(Path(sys.argv[1]), PublishedTree(sys.argv[2], points=200), name='s',\n"
+        "            classes=('bed', 'chair'))\n"
+    )
+    for delay in (0.0, 0.02, 0.05, 0.08, 0.12):
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, tmp_path / "s", tmp_path / "p"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(delay)
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        if (tmp_path / "s").exists():
+            assert len(open_pointset(tmp_path / "s")) == 240
+    importer = PublishedTree(tmp_path / "p", points=200)
+    import_into(tmp_path / "s", importer, name="s", classes=TWO)
+    assert len(open_pointset(tmp_path / "s")) == 240
+    assert not (tmp_path / ".s.importing").exists()
+
+
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        np.ones((5, 3)),
+        np.ones((0, 3)),
+        np.ones((4, 2)),
+        np.ones(3),
+        [[1, 2, np.nan]],
+        [[1, 2, 1e39]],
+    ],
+)
+def test_clouds_that_were_not_published_so(cloud):
+    with pytest.raises(DataError, match="where"):
+        check_cloud(np.array(cloud), 4, "where")
+
+
+def test_folders_that_do_not_fit(tmp_path):
+    xyz_tree(tmp_path)
+    (tmp_path / "cat" / "train").mkdir(parents=True)
+    with pytest.raises(DataError, match="cat"):
+        PublishedTree(tmp_path, points=4).read(TWO, tmp_path)
+    (tmp_path / "cat").rename(tmp_path / "bed" / "dev")
+    with pytest.raises(DataError, match="dev"):
+        PublishedTree(tmp_path, points=4).read(TWO, tmp_path)
+    (tmp_path / "bed" / "dev" / "train").rmdir()
+    (tmp_path / "bed" / "dev").rmdir()
+    xyz_tree(tmp_path, classes=("Chair",))
+    with pytest.raises(DataError, match="one name"):
+        PublishedTree(tmp_path, points=4).read(TWO, tmp_path)
+
+
+def test_scanobjectnn_leaves_out_other_classes(tmp_path, caplog):
+    fixtures.write_domain("scanobjectnn", tmp_path, SPLITS)
+    data = domain("scanobjectnn", tmp_path).open()
+    assert "has no clouds of bathtub, lamp, plant" in caplog.text
+    assert len(data) == 21
+    path = tmp_path / "published" / "scanobjectnn" / "main_split" / "test_objectdataset.h5"
+    with h5py.File(path) as file:
+        raw = file["data"][6]  # a display, y up
+    found = data.points[list(data.ids).index("monitor/test/test_objectdataset_00006")]
+    np.testing.assert_array_equal(found, np.stack([raw[:, 0], -raw[:, 2], raw[:, 1]], 1))
+
+
+def test_graspnet_takes_the_sensors_that_are_asked_for_and_stops_at_damage(tmp_path):
+    fixtures.write_domain("graspnetpc10", tmp_path, SPLITS)
+    both = domain("graspnetpc10", tmp_path).open()
+    assert set(both.splits) == {"train"}
+    assert {i.split("/")[2].split("_")[0] for i in both.ids} == {"kinect", "realsense"}
+    real = domain("graspnetpc10_realsense", tmp_path).open()
+    assert {i.split("/")[2].split("_")[0] for i in real.ids} == {"realsense"}
+    assert set(real.splits) == {"train", "test"}
+    root = tmp_path / "published" / "graspnetpc10" / "train" / "Real" / "kinect"
+    path = root / "3" / "scene_0003_0001.xyz"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:5], "0.5 nan 1", *lines[6:]]) + "\n")
+    found = domain("graspnetpc10_kinect", tmp_path)
+    with pytest.raises(DataError, match=r"0003_0001\.xyz, point 6"):
+        found.open()
+    assert not is_finished(found.folder)
+    data = domain("graspnetpc10_kinect", tmp_path, "published.on_error=skip").open()
+    (bad,) = [r for r in read_manifest(found.folder, data.classes) if r.status != "ok"]
+    assert bad.id == "3/train/kinect_scene_0003_0001"
+    assert "point 6" in bad.reason
+
+
+def test_which_clouds_show_the_same_object(tmp_path):
+    tree = PublishedTree(tmp_path)
+    assert tree.object_of("chair/test/scene0011_01_7") == "scene0011"
+    assert tree.object_of("bed/test/scene0011_00") == "scene0011"
+    assert tree.object_of("chair/train/scene_0011_0123") == ""
+    assert GraspNetPC(tmp_path).object_of("3/test/kinect_scene_0100_0007") == "3"
+    rows = [
+        ManifestRow("bed/test/scene0001_00_1", "bed", "test"),
+        ManifestRow("bed/test/other", "bed", "test"),
+        ManifestRow("bed/test/scene0002_00_1", "bed", "test", mesh_sha256="f" * 64),
+    ]
+    data = write_pointset(
+        tmp_path / "x", name="x", classes=("bed",), rows=rows, meta={},
+        arrays={"points": np.zeros((3, 4, 3))},
+    )  # fmt: skip
+    known = {rows[2].id: "f" * 64}
+    for published, more in ((None, {}), (tree, {rows[0].id: "scene0001"})):
+        made = Domain("d", "D", "D", tmp_path / "x", published=published, classes=["bed"])
+        assert _objects_by_id(data, made) == known | more
+
+
+_FULL = """
+import resource, sys
+from tests.datasets.test_domain import domain
+from qs3.errors import Qs3Error
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    domain("scannet10", sys.argv[1]).open()
+except Qs3Error:
+    sys.exit(3)
+"""
+
+
+def test_a_full_disk_leaves_nothing_that_opens(tmp_path):
+    """With a limit on the size of files, a write fails as it does on a full disk."""
+    fixtures.write_domain("scannet10", tmp_path, SPLITS)
+    done = subprocess.run([sys.executable, "-c", _FULL, str(tmp_path)], check=False)
+    assert done.returncode == 3
+    assert not is_finished(tmp_path / "scannet10")
+    data = domain("scannet10", tmp_path).open()  # with room, the same command completes it
+    assert open_pointset(tmp_path / "scannet10").sha256 == data.sha256

@@ -1,0 +1,148 @@
+"""Several datasets as one: all their clouds, an object's scans known as such, and stale joins."""
+
+import logging
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.datamodules.splits import lineage
+from qs3.datasets.domain import Domain, compose_domain
+from qs3.datasets.joined import Joined
+from qs3.errors import DataError, MissingDataError
+from qs3.store.manifest import read_manifest
+from qs3.store.meta import MadeOf
+from qs3.store.store import ManifestRow, open_pointset, write_pointset
+from tests.fixtures.published import cloud
+
+CLASSES = ("bed", "chair")
+
+
+def write(folder: Path, ids: list[str], points: int = 32, measured: int = 0, **more) -> None:
+    """A dataset of these objects, whose clouds depend on the folder's name, too."""
+    rows = [
+        ManifestRow(*(name, *name.split("/")[:2]), valid_points=measured or points, seed=7)
+        for name in ids
+    ]
+    rows.append(ManifestRow("bed/train/lost", "bed", "train", status="failed", reason="dark"))
+    write_pointset(
+        folder, name=folder.name, classes=CLASSES, rows=rows,
+        arrays={"points": [cloud(row.cls, folder.name + row.id, points) for row in rows[:-1]]},
+        meta=MadeOf(objects="embedded catalogue", **more).meta,
+    )  # fmt: skip
+
+
+def joined(tmp_path: Path, *names: str, **more) -> Domain:
+    importer = Joined(tmp_path, points=48, datasets=list(names))
+    return Domain(
+        "joined", "J", "J", tmp_path / "joined", published=importer, classes=list(CLASSES), **more
+    )
+
+
+def test_all_clouds_are_there_and_scans_of_an_object_are_called_so(tmp_path):
+    write(tmp_path / "a", ["bed/train/1", "bed/train/1~1", "chair/test/1"], sensor="x", views=1)
+    write(tmp_path / "b", ["bed/train/1", "chair/train/2"], points=48, sensor="y", views=5)
+    data = joined(tmp_path, "a", "b").open()
+    assert data.ids == (
+        *("bed/train/1", "bed/train/1~1", "bed/train/1~2", "chair/train/2", "chair/test/1"),
+    )
+    rows = read_manifest(tmp_path / "joined", CLASSES)
+    assert [row.origin for row in rows] == [
+        *("a/bed/train/1", "a/bed/train/1~1", "b/bed/train/1", "b/chair/train/2", "a/chair/test/1"),
+    ]
+    assert [row.more["dataset"] for row in rows] == ["a", "a", "b", "b", "a"]
+    assert {row.seed for row in rows} == {7}
+    a, b = open_pointset(tmp_path / "a"), open_pointset(tmp_path / "b")
+    np.testing.assert_array_equal(data.points[0][:32], a.points[0])
+    np.testing.assert_array_equal(data.points[0][32:], a.points[0][:16])  # filled up
+    np.testing.assert_array_equal(data.points[2], b.points[0])
+    assert [row.valid_points for row in rows] == [32, 32, 48, 48, 32]
+    assert str(data.made_of) == "embedded catalogue, x and y, 2 datasets joined"
+    assert not data.made_of.published
+
+
+def test_a_small_cloud_keeps_the_number_of_its_points(tmp_path):
+    write(tmp_path / "a", ["bed/train/1"])
+    first = joined(tmp_path, "a").open()
+    assert first.points.shape == (1, 48, 3)
+    importer = Joined(tmp_path, points=64, datasets=["joined"])
+    again = Domain("k", "K", "K", tmp_path / "k", published=importer, classes=list(CLASSES)).open()
+    assert read_manifest(tmp_path / "k", CLASSES)[0].valid_points == 32
+    np.testing.assert_array_equal(again.points[0][32:], again.points[0][:32])
+
+
+def test_a_cloud_that_was_thinned_keeps_the_number_that_was_measured(tmp_path):
+    write(tmp_path / "a", ["bed/train/1", "bed/train/2"], measured=5000)
+    assert joined(tmp_path, "a").open().points.shape == (2, 48, 3)
+    rows = read_manifest(tmp_path / "joined", CLASSES)
+    assert [row.valid_points for row in rows] == [5000, 5000]
+
+
+def test_no_object_trains_and_validates(tmp_path):
+    ids = [f"{cls}/train/{i}" for cls in CLASSES for i in range(20)]
+    write(tmp_path / "a", ids)
+    write(tmp_path / "b", ids[10:])
+    data = joined(tmp_path, "a", "b").open()
+    train, validation = lineage(data.ids, data.labels)
+    objects = np.array([name.split("~")[0] for name in data.ids])
+    assert len(train) + len(validation) == len(data) == 70
+    assert not set(objects[train]) & set(objects[validation])
+
+
+def test_a_change_of_a_dataset_is_noticed_and_its_absence_is_none(tmp_path):
+    write(tmp_path / "a", ["bed/train/1"])
+    write(tmp_path / "b", ["bed/train/2"])
+    domain = joined(tmp_path, "a", "b")
+    before = domain.open().sha256
+    assert domain.open().sha256 == before
+    shutil.rmtree(tmp_path / "b")
+    write(tmp_path / "b", ["bed/train/3"])
+    with pytest.raises(DataError):
+        domain.open()
+    with pytest.raises(DataError):
+        joined(tmp_path, "a").open()
+    shutil.rmtree(tmp_path / "a")
+    shutil.rmtree(tmp_path / "b")
+    assert domain.open().sha256 == before
+
+
+def test_what_is_missing_or_does_not_fit_is_named(tmp_path):
+    write(tmp_path / "a", ["bed/train/1"])
+    with pytest.raises(MissingDataError):
+        joined(tmp_path, "a", "b").open()
+    with pytest.raises(MissingDataError):
+        joined(tmp_path).open()
+    with pytest.raises(DataError):
+        joined(tmp_path, "a", "a").open()
+    write(tmp_path / "b", ["bed/train/1"], points=50)
+    with pytest.raises(DataError):
+        joined(tmp_path, "a", "b").open()
+    write_pointset(
+        tmp_path / "c", name="c", classes=("bed",), meta={},
+        rows=[ManifestRow("bed/train/1", "bed", "train")], arrays={"points": np.zeros((1, 4, 3))},
+    )  # fmt: skip
+    with pytest.raises(DataError):
+        joined(tmp_path, "a", "c").open()
+
+
+def test_by_its_config(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    ten = ("bathtub", "bed", "bookshelf", "cabinet", "chair")
+    ten += ("lamp", "monitor", "plant", "sofa", "table")
+    for name in ("roomscan10", "other"):
+        rows = [ManifestRow(f"{cls}/train/1", cls, "train") for cls in ten]
+        write_pointset(
+            tmp_path / name, name=name, classes=ten, rows=rows, meta={},
+            arrays={"points": [cloud(row.cls, name, 64) for row in rows]},
+        )  # fmt: skip
+    given = {
+        "paths.data_dir": str(tmp_path),
+        "published.datasets": "[roomscan10,other]",
+        "published.points": "64",
+        "unit": "metres",
+    }
+    domain = compose_domain("joined", given)
+    domain.check_scale("metres")
+    assert len(domain.open()) == 20
+    assert "importing joined datasets (J)" in caplog.text

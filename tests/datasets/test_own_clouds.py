@@ -1,0 +1,286 @@
+"""Folders of one's own clouds: formats, layouts, and sets without labels."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tracemalloc
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from qs3.datasets.folders import CloudFolder, PublishedTree
+from qs3.datasets.importing import Importer, import_into
+from qs3.errors import DataError
+from qs3.store.store import open_pointset, read_manifest
+from tests.datasets.own_clouds import CLOUD, FORMATS, TWO, own, write
+
+
+def test_layouts_are_recognised(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        for cls in TWO:
+            for split in ("train", "test"):
+                write(tmp_path / "one" / cls / split / f"{name}.xyz")
+                write(tmp_path / "two" / split / cls / f"{name}.npy")
+    expected = [f"{c}/{s}/{n}" for s in ("train", "test") for c in TWO for n in ("a", "b")]
+    for root in ("one", "two"):
+        _, rows = CloudFolder(tmp_path / root, points=4).read(TWO, tmp_path)
+        assert [row.id for row in rows] == expected
+
+
+def test_every_fifth_of_a_class_tests(tmp_path: Path) -> None:
+    for i in range(7):
+        write(tmp_path / "Chair" / f"c{i}.xyz", CLOUD + i)
+        write(tmp_path / "bed" / f"b{i}.ply", CLOUD + i)
+    clouds, rows = CloudFolder(tmp_path, points=4).read(TWO, tmp_path)
+    assert [r.id for r in rows if r.split == "test"] == ["bed/test/b4", "chair/test/c4"]
+    assert len(rows) == 14
+    place = [row.id for row in rows].index("chair/test/c4")
+    np.testing.assert_array_equal(clouds[place], (CLOUD + 4).astype("f4"))
+    _, rows = CloudFolder(tmp_path, points=4, test_every=0).read(TWO, tmp_path)
+    assert {row.split for row in rows} == {"train"}
+
+
+def test_without_labels(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "b.pcd")
+    write(tmp_path / "in" / "deep" / "a.xyz", CLOUD + 1)
+    importer = CloudFolder(tmp_path / "in", points=4, layout="none")
+    import_into(tmp_path / "store", importer, name="mine", classes=TWO)
+    data = open_pointset(tmp_path / "store")
+    assert not data.labelled
+    assert data.labels.tolist() == [-1, -1]
+    assert data.meta["labelled"] is False
+    assert data.ids == ("train/b", "train/deep/a")
+    assert data.splits.tolist() == ["train", "train"]
+    assert [row.cls for row in read_manifest(tmp_path / "store", TWO)] == ["", ""]
+    assert data.counts() == {"train": {"bed": 0, "chair": 0}}
+    assert data.split("train").ids == data.ids
+
+
+def test_the_folder_says_the_split_and_a_name_where_no_folder_does(tmp_path: Path) -> None:
+    """`test/train_station.npy` must not train."""
+    several = np.stack([CLOUD, CLOUD + 1])
+    for place in ("in/test/train_station", "in/train/test_hall", "flat/test_hall", "flat/hall"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / f"{place}.npy", several)
+    _, rows = CloudFolder(tmp_path / "in", points=4).read(TWO, tmp_path)
+    assert [(row.split, row.origin) for row in rows] == [
+        *(("train", f"train/test_hall.npy[{i}]") for i in range(2)),
+        *(("test", f"test/train_station.npy[{i}]") for i in range(2)),
+    ]
+    _, rows = CloudFolder(tmp_path / "flat", points=4).read(TWO, tmp_path)
+    assert [(row.split, row.origin) for row in rows] == [
+        *(("train", f"hall.npy[{i}]") for i in range(2)),
+        *(("test", f"test_hall.npy[{i}]") for i in range(2)),
+    ]
+
+
+def test_any_number_of_points(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(0)
+    large = rng.standard_normal((300, 3))
+    write(tmp_path / "bed" / "large.xyz", large)
+    write(tmp_path / "bed" / "small.xyz")
+    clouds, rows = CloudFolder(tmp_path, points=16, test_every=0).read(("bed",), tmp_path)
+    assert [row.valid_points for row in rows] == [300, 4]
+    assert {cloud.shape for cloud in clouds} == {(16, 3)}
+    assert (clouds[0][0] == large[0].astype("f4")).all()
+    assert len(np.unique(clouds[0], axis=0)) == 16
+    np.testing.assert_array_equal(clouds[1], np.tile(CLOUD, (4, 1)).astype("f4"))
+    assert "under 16 points" in caplog.text
+
+
+@pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])
+def test_up_is_a_rotation_to_z(tmp_path: Path, up: str) -> None:
+    importer = CloudFolder(tmp_path, up=up)
+    turned = importer.turn(np.eye(3), "bed").T  # columns: where the axes go
+    assert np.linalg.det(turned) == pytest.approx(1)
+    axis = np.zeros(3)
+    axis["xyz".index(up[-1])] = -1 if up.startswith("-") else 1
+    np.testing.assert_array_equal(importer.turn(axis[None], "bed")[0], [0, 0, 1])
+
+
+def test_wrong_folders_and_names(tmp_path: Path) -> None:
+    write(tmp_path / "bed" / "a.xyz")
+    write(tmp_path / "boat" / "a.xyz")
+    with pytest.raises(DataError, match="boat"):
+        CloudFolder(tmp_path, points=4).read(TWO, tmp_path)
+    write(tmp_path / "b" / "bed" / "a.xyz")
+    write(tmp_path / "b" / "bed" / "a.ply")
+    with pytest.raises(DataError, match="one name"):
+        CloudFolder(tmp_path / "b", points=4).read(TWO, tmp_path)
+    write(tmp_path / "c" / "bed" / "train" / "deep" / "a.xyz")
+    with pytest.raises(DataError, match="deep"):
+        CloudFolder(tmp_path / "c", points=4).read(TWO, tmp_path)
+    (tmp_path / "e").mkdir()
+    assert not CloudFolder(tmp_path / "e").is_there()
+
+
+def test_linked_folders_are_not_followed(tmp_path: Path) -> None:
+    """A link to a folder above would give every cloud some forty times."""
+    write(tmp_path / "a.xyz")
+    (tmp_path / "again").symlink_to(tmp_path)
+    assert len(CloudFolder(tmp_path, points=4, layout="none").items(TWO)) == 1
+
+
+def test_clouds_with_and_without_labels_are_not_one_dataset(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "train" / "bed" / "a.xyz")
+    write(tmp_path / "in" / "train" / "b.xyz")
+    with pytest.raises(DataError):
+        own(tmp_path, layout="split/class").open()
+    assert not (tmp_path / "store").exists()
+
+
+def test_files_of_several_clouds(tmp_path: Path) -> None:
+    many = np.stack([CLOUD, CLOUD + 1])
+    with h5py.File(tmp_path / "train_0.h5", "w") as file:
+        file["data"], file["label"] = many, np.array([1, 0])
+    np.savez(tmp_path / "test_a.npz", points=many, cls=np.array(["bed", "chair"]))
+    clouds, rows = CloudFolder(tmp_path, points=4).read(TWO, tmp_path)
+    assert [row.id for row in rows] == [
+        "bed/train/train_0_0001", "chair/train/train_0_0000",
+        "bed/test/test_a_0000", "chair/test/test_a_0001",
+    ]  # fmt: skip
+    assert [cloud[0, 0] for cloud in clouds] == [1, 0, 0, 1]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_damage_can_be_skipped_and_is_recorded(tmp_path: Path, suffix: str) -> None:
+    """A damaged file, a cloud without points, a label of no class."""
+    many, labels = np.stack([CLOUD, CLOUD + 1, CLOUD * np.nan, CLOUD]), np.array([1, 7, 0, 0])
+    folder = tmp_path / "in"
+    folder.mkdir()
+    if suffix == ".npz":
+        np.savez(folder / "a.npz", points=many, label=labels)
+    else:
+        with h5py.File(folder / "a.h5", "w") as file:
+            file["data"], file["label"] = many, labels
+    (folder / "b.npz").write_bytes(b"PK")
+    with pytest.raises(DataError, match=rf"a\{suffix}, cloud 1"):
+        own(tmp_path).open()
+    data = own(tmp_path, on_error="skip").open()
+    assert data.ids == ("bed/train/a_0003", "chair/train/a_0000")
+    rows = read_manifest(tmp_path / "store", TWO)
+    left_out = {row.origin for row in rows if row.status == "skipped"}
+    assert left_out == {f"a{suffix}[1]", f"a{suffix}[2]", "b.npz"}
+    own(tmp_path, on_error="skip").open()
+
+
+def test_a_store_without_damage_may_be_used_where_damage_is_left_out(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "bed" / "a.xyz")
+    own(tmp_path, test_every=0).open()
+    own(tmp_path, test_every=0, on_error="skip").open()
+    with pytest.raises(DataError, match="up"):
+        own(tmp_path, test_every=0, up="x", on_error="skip").open()
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_points_that_are_not_finite_are_left_out(tmp_path: Path, suffix: str) -> None:
+    cloud = np.random.default_rng(0).standard_normal((12, 3)).astype(np.float32)
+    left = np.delete(cloud, [0, 5], axis=0)
+    cloud[0], cloud[5, 1] = np.nan, np.inf
+    write(tmp_path / "bed" / f"a{suffix}", cloud)
+    importer = CloudFolder(tmp_path, points=10, test_every=0)
+    (read,), (row,) = importer.read(("bed",), tmp_path)
+    np.testing.assert_array_equal(read, left)
+    assert row.valid_points == 10
+
+
+def test_own_classes_are_found_as_they_are_written(tmp_path: Path) -> None:
+    write(tmp_path / "Box" / "a.xyz")
+    write(tmp_path / "coffee mug" / "a.xyz")
+    _, rows = CloudFolder(tmp_path, points=4, test_every=0).read(("Box", "coffee-mug"), tmp_path)
+    assert [row.cls for row in rows] == ["Box", "coffee-mug"]
+
+
+def test_changed_files_are_noticed(tmp_path: Path) -> None:
+    for name in ("bed/a.xyz", "bed/b.npy", "chair/a.npz"):
+        write(tmp_path / "in" / name)
+    domain = own(tmp_path, test_every=0)
+    before = domain.open().sha256
+    (tmp_path / "in" / "notes.md").write_text("not a cloud")
+    (tmp_path / "in" / ".hidden.xyz").write_text("1 2 3")
+    assert domain.open().sha256 == before
+
+    new = write(tmp_path / "in" / "chair" / "c.ply")
+    with pytest.raises(DataError):
+        domain.open()
+    new.unlink()
+    assert domain.open().sha256 == before
+    path = tmp_path / "in" / "bed" / "b.npy"
+    changed = path.stat().st_mtime_ns + 1
+    os.utime(path, ns=(changed, changed))
+    with pytest.raises(DataError):
+        domain.open()
+    (tmp_path / "in").rename(tmp_path / "away")  # put away after the import
+    assert domain.open().sha256 == before
+
+
+def test_a_class_that_is_called_as_a_split_is_not_taken_for_one(tmp_path: Path) -> None:
+    several = np.stack([CLOUD + i for i in range(5)])
+    for cls in ("test", "bed"):
+        (tmp_path / "in" / cls).mkdir(parents=True)
+        np.save(tmp_path / "in" / cls / "a.npy", several)
+    domain = dataclasses.replace(own(tmp_path), classes=["test", "bed"])
+    ids = domain.open().ids
+    assert "test/test/a_0004" in ids
+    assert "test/train/a_0000" in ids
+    assert domain.open().ids == ids
+
+
+def test_files_that_change_during_the_import(tmp_path: Path) -> None:
+    """Half of a folder that is still being copied must not become a store."""
+
+    class Slow(CloudFolder):
+        def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
+            write(tmp_path / "in" / "b.xyz")
+            return cloud
+
+    write(tmp_path / "in" / "a.xyz")
+    with pytest.raises(DataError):
+        import_into(tmp_path / "s", Slow(tmp_path / "in", points=4), name="s", classes=TWO)
+    assert not (tmp_path / "s").exists()
+
+
+def test_one_file_is_in_memory_at_a_time(tmp_path: Path) -> None:
+    """Else a folder of large files would be in memory twice before the first cloud is thinned."""
+    rng = np.random.default_rng(0)
+    for i in range(8):
+        many = rng.standard_normal((10, 5000, 3))  # 1.2 MB
+        np.save(tmp_path / f"a{i}.npy", many)
+        np.savez(tmp_path / f"b{i}.npz", points=many)
+        with h5py.File(tmp_path / f"c{i}.h5", "w") as file:
+            file["data"] = many
+    importer = CloudFolder(tmp_path, points=4)
+    importer.items(TWO[:1])  # modules are imported outside the measurement
+    tracemalloc.start()
+    try:
+        items = importer.items(TWO[:1])
+        total = sum(len(item.load()) for item in items)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert total == 3 * 8 * 10 * 5000
+    assert peak < 4 << 20, "all files together have 29 MB"
+
+
+@pytest.mark.parametrize("importer", [CloudFolder, PublishedTree])
+def test_names_equal_but_for_case(tmp_path: Path, importer: type[Importer]) -> None:
+    """Elsewhere one of them would overwrite the other."""
+    write(tmp_path / "bed" / "train" / "a.xyz")
+    write(tmp_path / "bed" / "train" / "A.XYZ")
+    with pytest.raises(DataError):
+        importer(tmp_path, points=4).items(("bed",))
+
+
+def test_ids_of_splits_without_labels(tmp_path: Path) -> None:
+    for name in ("train/a.xyz", "train/b.npy", "test/a.xyz"):
+        write(tmp_path / name)
+    np.save(tmp_path / "test" / "m.npy", np.stack([CLOUD, CLOUD]))
+    _, rows = CloudFolder(tmp_path, points=4).read(TWO, tmp_path)
+    ids = ["train/a", "train/b", "test/a", "test/m_0000", "test/m_0001"]
+    assert [row.id for row in rows] == ids
+    _, rows = CloudFolder(tmp_path, points=4, layout="none").read(TWO, tmp_path)
+    ids = ["test/a", "test/m_0000", "test/m_0001", "train/a", "train/b"]
+    assert [row.id for row in rows] == [f"train/{id_}" for id_ in ids]

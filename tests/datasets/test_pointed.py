@@ -1,0 +1,211 @@
+"""What is pointed at in a depth image, by a mask or a box, is the thing that was placed there."""
+
+from __future__ import annotations
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from qs3.datasets.depth_images import Pinhole
+from qs3.datasets.pointed import GIVEN, LEVEL, PLANES, point_out
+from qs3.datasets.vertical import angle_deg, planes_up_steep
+from qs3.errors import DataError
+from tests.fixtures.frame_files import Shot, Thing, kinect
+
+STEP_M = 0.06  # half a step of a Kinect's disparity and four sigma of noise at 3.5 m
+ROOM = Shot(
+    [Thing("chair", -0.6, 2.4, 35), Thing("cabinet", 0.8, 2.7, 25, 0.8)],
+    pitch_deg=14,
+    roll_deg=3,
+)
+CAMERA = Pinhole(*ROOM.camera)
+
+
+def seen(shot=ROOM):
+    """Noisy depth, and the number of the thing that each pixel shows, from 1."""
+    depth, shown = shot.render()
+    return kinect(depth, 1), np.maximum(shown + 1, 0)
+
+
+def box_of(mask, around=5):
+    v, u = np.nonzero(mask)
+    return u.min() - around, v.min() - around, u.max() + 1 + around, v.max() + 1 + around
+
+
+def test_each_number_of_a_mask_is_one_object_and_lies_on_its_thing():
+    depth, mask = seen()
+    mask = np.where(mask == 2, 7, mask)
+    found = point_out(depth, CAMERA, mask=mask, up=9.81 * ROOM.up_in_camera)
+    assert [one.name for one in found] == ["[1]", "[7]"]
+    for one, thing in zip(found, ROOM.things, strict=True):
+        where = ROOM.to_world(one.piece.points_m.astype(float))
+        assert thing.distance(where).max() < STEP_M
+        assert len(where) > 0.8 * ((one.mask) & (depth > 0)).sum()
+        assert (one.tier, one.cautions, one.up, one.why) == ("clean", (), GIVEN, "")
+        assert one.without_depth == (one.mask & (depth == 0)).sum() > 0
+    (only,) = point_out(depth, CAMERA, mask=mask, only=7, up=ROOM.up_in_camera)
+    np.testing.assert_array_equal(only.piece.points_m, found[1].piece.points_m)
+    (bare,) = point_out(depth, CAMERA, mask=mask == 7, up=ROOM.up_in_camera)
+    assert bare.name == ""
+    np.testing.assert_array_equal(bare.piece.points_m, found[1].piece.points_m)
+
+
+@pytest.mark.parametrize("cls", ["chair", "table", "sofa", "monitor", "plant"])
+def test_a_box_holds_its_thing_without_floor_wall_and_neighbours(cls):
+    size = {"sofa": 0.7, "table": 0.8}.get(cls, 0.9)
+    shot = Shot(
+        [
+            Thing(cls, -0.3, 2.6, 30, size, z=0.6 if cls == "monitor" else 0),
+            Thing("toy", -0.05, 3.6, boxes=((0, 0, 0.3, 0.4, 0.4, 0.6),)),  # behind, in the box
+        ],
+        pitch_deg=18,
+        roll_deg=-3,
+    )
+    depth, mask = seen(shot)
+    (one,) = point_out(depth, CAMERA, box=box_of(mask == 1), up=shot.up_in_camera)
+    own, right = one.mask & (depth > 0), (mask == 1) & (depth > 0)
+    assert (own & ~right).sum() < 0.01 * own.sum()
+    assert (own & right).sum() > 0.9 * right.sum()
+    assert shot.things[0].distance(shot.to_world(one.piece.points_m.astype(float))).max() < STEP_M
+    assert one.tier == "clean"
+
+
+def test_a_box_of_nothing_but_background_is_cautioned():
+    depth, _ = seen(Shot([], pitch_deg=15))
+    (wall,) = point_out(depth, CAMERA, box=(200, 20, 320, 100), up=(0, -1, -0.2))
+    assert [caution.kind for caution in wall.cautions] == ["box"]
+    assert wall.tier == "hard"
+    (floor,) = point_out(depth, CAMERA, box=(200, 400, 320, 460), up=Shot([]).up_in_camera)
+    assert "box" in [caution.kind for caution in floor.cautions]
+
+
+def test_a_box_of_the_floor_before_a_thing_says_that_the_plane_took_its_pixels():
+    """The thing is all that is left, and none of it lies in the box."""
+    depth, mask = seen()
+    *_, bottom = box_of(mask == 1, around=0)
+    top = bottom + 3
+    foot = int(np.median(np.nonzero(mask[bottom - 4 : bottom] == 1)[1]))
+    box = (foot - 20, top, foot + 20, top + 25)
+    inside = np.zeros_like(mask, dtype=bool)
+    inside[top : top + 25, foot - 20 : foot + 20] = True
+    (one,) = point_out(depth, CAMERA, box=box, up=ROOM.up_in_camera)
+    assert one.why.startswith("all of its pixels with depth belong to the plane")
+    assert (one.mask == inside).all()
+    assert (len(one.piece.points_m), one.tier) == (0, "poor")
+    (one,) = point_out(np.where(inside, 0, depth), CAMERA, box=box, up=ROOM.up_in_camera)
+    assert one.why == "none of its 1000 pixels has depth"
+    assert one.without_depth == 1000
+
+
+def test_what_is_cut_off_covered_or_small_is_cautioned_and_still_there():
+    cut_off = Shot([Thing("chair", 1.45, 2.2, 20)], pitch_deg=12)
+    depth, mask = seen(cut_off)
+    (one,) = point_out(depth, CAMERA, mask=mask, up=cut_off.up_in_camera)
+    assert one.tier == "poor"
+    assert "cut off" in [caution.kind for caution in one.cautions]
+    assert len(one.piece.points_m) > 700
+    covered = Shot(
+        [
+            Thing("sofa", 0.0, 3.2, 25, 0.8),
+            Thing("toy", 0.05, 1.9, boxes=((0, 0, 0.3, 0.5, 0.3, 0.6),)),
+        ]
+    )
+    depth, mask = seen(covered)
+    (one,) = point_out(depth, CAMERA, mask=mask == 1, up=covered.up_in_camera)
+    assert one.tier == "hard"
+    assert [caution.kind for caution in one.cautions] == ["covered"]
+    far = Shot([Thing("lamp", 0, 5.5, size=0.4)], wall_m=7)
+    depth, mask = seen(far)
+    (one,) = point_out(depth, CAMERA, mask=mask, up=far.up_in_camera)
+    assert one.cautions[0].words == f"{len(one.piece.points_m)} pixels with depth, fewer than 700"
+
+
+def test_two_things_with_one_number_are_cautioned_and_two_parts_of_one_are_not():
+    depth, mask = seen()
+    (both,) = point_out(depth, CAMERA, mask=mask > 0, up=ROOM.up_in_camera)
+    _, larger = point_out(depth, CAMERA, mask=mask, up=ROOM.up_in_camera)
+    np.testing.assert_array_equal(both.piece.points_m, larger.piece.points_m)
+    assert "several" in [caution.kind for caution in both.cautions]
+    parted = mask == 1
+    rows = np.flatnonzero(parted.any(axis=1))
+    parted[rows[len(rows) // 2]] = False  # a wire before it
+    (one,) = point_out(depth, CAMERA, mask=parted, up=ROOM.up_in_camera)
+    assert one.cautions == ()
+
+
+def test_an_object_without_depth_says_so_and_the_others_go_on():
+    depth, mask = seen()
+    depth[mask == 1] = 0
+    none, some = point_out(depth, CAMERA, mask=mask, up=ROOM.up_in_camera)
+    assert none.why == f"none of its {(mask == 1).sum()} pixels has depth"
+    assert some.why == ""
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 15.0, 30.0, 60.0])
+def test_an_up_that_the_planes_contradict_is_cautioned(off_deg):
+    """Beyond 20 degrees, with what they say; the up that is given is used nevertheless."""
+    depth, mask = seen()
+    turn, _ = cv2.Rodrigues(np.array([0.0, 0.0, np.deg2rad(off_deg)]))
+    given = turn @ ROOM.up_in_camera
+    (one,) = point_out(depth, CAMERA, mask=mask == 1, up=given)
+    assert one.up == "given"
+    said = [caution.words for caution in one.cautions if caution.kind == "up"]
+    assert len(said) == (off_deg > 20)
+    if said:
+        x, y, z, off = map(float, re.search(r"up=(\S+),(\S+),(\S+), (\d+)°", said[0]).groups())
+        assert abs(off - angle_deg(given, ROOM.up_in_camera)) < 3
+        assert angle_deg(np.array([x, y, z]), ROOM.up_in_camera) < 3
+
+
+def test_up_is_fitted_or_level_and_says_which():
+    depth, mask = seen()
+    fitted = point_out(depth, CAMERA, mask=mask)
+    known = point_out(depth, CAMERA, mask=mask, up=ROOM.up_in_camera)
+    assert {one.up for one in fitted} == {PLANES}
+    assert not any(one.cautions for one in fitted)
+    for a, b in zip(fitted, known, strict=True):
+        np.testing.assert_allclose(a.piece.points_m[:, 2], b.piece.points_m[:, 2], atol=0.03)
+    alone = np.where(mask == 1, depth, 0)
+    (one,) = point_out(np.where(np.arange(640) % 3, 0, alone), CAMERA, mask=mask == 1)
+    assert one.up == LEVEL
+    assert "counts as level" in one.cautions[-1].words
+    (down,) = point_out(depth, CAMERA, mask=mask == 1, up=-ROOM.up_in_camera)
+    assert [caution.kind for caution in down.cautions] == ["up"]
+
+
+@pytest.mark.parametrize("pitch_deg", [0, 15, 30, 45, 55, 70, 85])
+def test_a_fitted_vertical_is_right_or_not_sure(pitch_deg):
+    """A wall seen steeply from above looks like a floor: what is wrong must not be sure."""
+    shot = Shot(
+        [Thing("chair", -0.3, 2.4 if pitch_deg < 40 else 1.6, 35)],
+        pitch_deg=pitch_deg,
+        roll_deg=4,
+        height_m=1.4 + pitch_deg / 60,
+    )
+    up, sure = planes_up_steep(seen(shot)[0], CAMERA)
+    right = angle_deg(up, shot.up_in_camera) < 1.5
+    assert right or not sure
+    assert right or pitch_deg > 50
+    assert sure or pitch_deg > 40
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        {},
+        {"mask": np.ones((4, 4), int), "box": (0, 0, 1, 1)},
+        {"mask": np.ones((4, 4), int)},
+        {"mask": np.zeros((480, 640), int)},
+        {"mask": np.ones((480, 640))},
+        {"mask": np.ones((480, 640), int), "only": 3},
+        {"box": (5, 5, 5, 9)},
+        {"box": (700, 5, 900, 9)},
+        {"box": (0.3, 0.2, 0.6, 0.8)},  # fractions of the picture
+        {"box": (5, 5, 90, 90), "up": (0, 0, 0)},
+    ],
+)
+def test_what_points_at_nothing(words):
+    with pytest.raises(DataError):
+        point_out(seen()[0], CAMERA, **words)
