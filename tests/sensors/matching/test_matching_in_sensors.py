@@ -110,9 +110,7 @@ def test_the_steps_that_are_stated_are_those_of_the_disparity(sensor, steps):
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "sensor/matcher").iterdir()))
 def test_every_matcher_is_a_choice_and_its_file_shows_all_it_has(name):
-    sensor = "speckle_stereo_small" if name.endswith("_small") else "speckle_stereo"
-    if (CONF / f"sensor/{name}.yaml").is_file():  # a device's own
-        sensor = name
+    sensor = name if (CONF / f"sensor/{name}.yaml").is_file() else "speckle_stereo"
     cfg = composed(None, f"+sensor={sensor}", f"sensor/matcher={name}")
     assert (CONF / f"sensor/matcher/{name}.yaml").read_text().startswith("# ")
     matcher = build(cfg.sensor).matcher
