@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from qs3.calibration import bench, edges, planes
-from qs3.calibration.bands import Band, judge, nguyen_axial_m
+from qs3.calibration.bands import judge
 from qs3.calibration.subject import Subject, TiltedPlane, load
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
@@ -170,12 +170,6 @@ def test_a_fitted_preset_is_held_against_what_it_states(renderer, baseline_m):
     failed = " ".join(failures(judge(Subject("mine", other), rows, edge)))
     assert "bias" in failed
     assert "fill" in failed
-
-
-def test_a_band_holds_within_its_limits():
-    assert Band("s", "b", 1.0, 1.0, 2.0).holds
-    assert not Band("s", "b", np.nan, 1.0, 2.0).holds
-    assert float(nguyen_axial_m(1.4)) == pytest.approx(0.0031)
 
 
 def test_the_command_writes_its_page_and_numbers(tmp_path):

@@ -29,22 +29,6 @@ def test_without_speckle_of_its_own_ambient_light_costs_less(kind, renderer):
     assert good[1] > 0.6, (good, error)
 
 
-def test_a_bright_wall_darkens_the_object_where_the_whole_image_is_metered(renderer):
-    thing = replace(square(2.0, 0.1, albedo=0.08), label=1)
-    wall = replace(square(2.5, 0.5, albedo=0.8), label=0)
-    quiet = InfraredCamera(read_noise_e=0.0, electrons_at_white=1e9, white_quantile=1.0)
-    grey = {}
-    for metering in ("object", "image", None):
-        sensor = SpeckleStereo(infrared=replace(quiet, metering=metering))
-        frame = scan(sensor, [thing, wall], renderer, box=box_of(thing))
-        clean = frame.images["clean"]
-        grey[metering] = frame.images["left"][np.abs(clean - 2.0) < 0.01].mean()
-    # What is as bright as can be: ambient light and a dot on the wall, over the same on the object.
-    brighter = 0.8 * (0.15 + 16 / 2.5**2) / (0.08 * (0.15 + 16 / 2.0**2))
-    assert grey["object"] / grey["image"] == pytest.approx(brighter, rel=0.1)
-    assert grey[None] == grey["object"]
-
-
 @pytest.mark.parametrize("kind", [ReferenceSpeckle, FringeProjection])
 def test_sensors_with_one_camera_go_by_the_image_unless_told_otherwise(kind, renderer):
     thing = replace(square(2.0, 0.1, albedo=0.08), label=1)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.blensor_kinect import DotMask, spread
 from qs3.sensors.optics.misalignment import smooth_field
-from qs3.sensors.optics.visibility import Reason
 from tests.sensors.scenery import middle, rectangle, scan, square
 
 KINECT = DotMask()
@@ -98,13 +97,6 @@ def test_the_window_counts_as_a_loop_over_its_dots_does(renderer):
         expected[r, c] = 3 * seen > 2 * dots
     assert expected.any()
     np.testing.assert_array_equal(np.isfinite(frame.depth_m), expected)
-
-
-def test_reasons(renderer):
-    frame = scan(KINECT, [square(1.5)], renderer)
-    assert set(np.unique(frame.reason)) <= {Reason.OK, Reason.EMPTY, Reason.UNMATCHED}
-    far = scan(KINECT, [square(7.0, 1.0)], renderer)
-    assert (middle(far.reason) == Reason.RANGE).mean() > 0.95
 
 
 def test_the_field_is_smooth_of_unit_size_and_knows_no_window():

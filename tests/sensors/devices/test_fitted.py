@@ -45,26 +45,6 @@ def test_neighbours_share_noise_as_stated(size):
     assert down == pytest.approx(expected, abs=0.02)
 
 
-def test_noise_is_as_strong_at_the_border_and_as_long_in_the_camera_s_pixels():
-    image = np.full((40, 30), 2.0, np.float32)
-    errors = {
-        step: np.stack([
-            FittedDepth(correlation_px=4.0, step_px=step).measure(
-                image, np.ones_like(image), np.random.default_rng(seed)
-            )[0] - 2
-            for seed in range(150)
-        ])
-        for step in (1, 4)
-    }  # fmt: skip
-    for found in errors.values():
-        edges = [found[:, :, 0], found[:, :, -1], found[:, 0], found[:, -1]]
-        for edge in edges:
-            assert edge.std() == pytest.approx(found[:, 15:25, 10:20].std(), rel=0.06)
-    apart = np.corrcoef(errors[1][:, :, 4:].ravel(), errors[1][:, :, :-4].ravel())[0, 1]
-    samples = np.corrcoef(errors[4][:, :, 1:].ravel(), errors[4][:, :, :-1].ravel())[0, 1]
-    assert samples == pytest.approx(apart, abs=0.02)
-
-
 def test_fill_rates_are_interpolated_over_the_tilt():
     sensor = FittedDepth(tilts_deg=(0, 60), fill_rates=(0.95, 0.35))
     for tilt, rate in ((0, 0.95), (30, 0.65), (60, 0.35), (80, 0.35)):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.devices.fringe import FringeProjection
-from qs3.sensors.optics.fringe_code import FringeCode, phase_of
+from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.visibility import Reason, sample_centres
 from qs3.sensors.renderers.base import Projector, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
@@ -88,17 +88,6 @@ def test_slides_are_what_decoding_expects():
     place, _, _ = code.decode(slides.astype(float))
     expected = np.broadcast_to((np.arange(64) + 0.5) / 64, place.shape)
     np.testing.assert_allclose(place, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("steps", [4, 5, 8])
-def test_phase_noise_is_the_textbooks(steps):
-    rng = np.random.default_rng(steps)
-    phase, modulation, noise = 0.7, 50.0, 2.0
-    angle = phase + 2 * np.pi / steps * np.arange(steps)[:, None, None]
-    exposures = 100 + modulation * np.cos(angle) + noise * rng.normal(size=(steps, 200, 200))
-    found, strength = phase_of(exposures)
-    assert (found - phase).std() == pytest.approx(np.sqrt(2 / steps) * noise / modulation, rel=0.02)
-    assert strength.mean() == pytest.approx(modulation, rel=0.01)
 
 
 @pytest.mark.slow

@@ -5,11 +5,11 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.sensors.matching import CensusMatcher
-from qs3.sensors.matching.base import linearised, offset
+from qs3.sensors.matching.base import offset
 from qs3.sensors.matching.census import _best_of_other, aggregate, census, count_ones
 from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.optics.visibility import Reason
@@ -131,16 +131,6 @@ def test_a_fit_returns_the_minimum_of_its_own_curve(true, scale):
     assert offset(*costs.astype(np.float32).reshape(3, 1))[0] == pytest.approx(true, abs=1e-3)
 
 
-@given(st.floats(-1, 1))
-@settings(deadline=None)
-def test_linearising_keeps_order_sign_and_ends(a_factor):
-    phase = np.linspace(-0.5, 0.5, 101, dtype=np.float32)
-    out = linearised(phase, a_factor)
-    assert (np.diff(out) > -1e-6).all()
-    np.testing.assert_allclose(out, -out[::-1], atol=1e-6)
-    np.testing.assert_allclose(out[[0, 50, 100]], [-0.5, 0, 0.5], atol=1e-6)
-
-
 TEXTURES = [
     {"fill": 0.08, "sigma_px": 0.6},
     {"fill": 0.15, "dot_px": 2.0, "sigma_px": 0.8},
@@ -184,22 +174,6 @@ def test_gain_and_offset_change_no_bit():
     plain, loud = matcher.match(image, other), matcher.match(2 * image + 3, other + 60)
     assert np.isfinite(plain.disparity[:, 50:]).mean() > 0.9
     np.testing.assert_array_equal(plain.disparity, loud.disparity)
-
-
-@pytest.mark.parametrize("paths", [0, 8])
-def test_a_window_gives_the_values_of_the_whole_image(paths):
-    texture = dots(90, 320, 6)
-    image, other = seen(texture, 11.4, 1), seen(texture, 0, 2).astype(np.float32)
-    matcher = CensusMatcher(64, -20, paths=paths)
-    rows, columns, reach = slice(10, 80), slice(120, 240), matcher.reach_px
-    whole = matcher.match(image, other).disparity[rows, columns]
-    part = matcher.match(image[rows, columns], other[rows], first=120).disparity
-    inner = (slice(reach, -reach), slice(reach, -reach))
-    same = (whole[inner] == part[inner]) | (np.isnan(whole[inner]) & np.isnan(part[inner]))
-    if paths == 0:
-        assert same.all()
-    else:  # paths begin at the border of the window
-        assert same.mean() > 0.995
 
 
 def test_reasons_say_why_there_is_no_match():

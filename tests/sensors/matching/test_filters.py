@@ -41,15 +41,6 @@ def test_the_spatial_filter_equals_a_loop_over_pixels(image, alpha, step, iterat
         np.testing.assert_array_equal(out, image)
 
 
-def test_the_spatial_filter_makes_flying_pixels_of_low_steps():
-    low = np.where(np.arange(40) < 20, 10.0, 10.8).astype(np.float32)[None].repeat(9, 0)
-    out = SpatialFilter(0.4, max_step_px=1.0).apply(low)
-    between = (out > 10.2) & (out < 10.6)
-    assert between.any(axis=1).all()
-    kept = SpatialFilter(0.4, max_step_px=0.5).apply(low)
-    np.testing.assert_allclose(kept, low, atol=1e-5)
-
-
 def regions(image, step):
     """Sizes of connected regions by flood fill."""
     size = np.zeros(image.shape, int)

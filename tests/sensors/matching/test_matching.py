@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from qs3.sensors.matching import (
-    NormalisedCorrelation,
     ReferenceMatcher,
     SemiGlobalMatcher,
     StereoBlockMatcher,
@@ -25,16 +24,6 @@ def test_scores_equal_a_brute_force_correlation():
         covariance = (window * other).mean() - window.mean() * other.mean()
         expected = covariance / (window.std() * other.std())
         assert scores[k, row, col] == pytest.approx(expected, abs=1e-3)
-
-
-def test_the_reference_matcher_is_correlation_with_the_steps_of_a_kinect():
-    texture = dots(60, 300, seed=10)
-    reference = seen(texture, 0.0).astype(np.float32)
-    image = seen(texture, 4.3)[:, 60:200]
-    plain = NormalisedCorrelation(9, -24, 64).match(image, reference, 60)
-    kinect = ReferenceMatcher().match(image, reference, 60)
-    np.testing.assert_array_equal(kinect.disparity, np.rint(plain.disparity * 8) / 8)
-    np.testing.assert_array_equal(kinect.reason, plain.reason)
 
 
 def test_sgbm_rounds_towards_zero_and_is_repaired():

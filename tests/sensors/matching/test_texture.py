@@ -32,14 +32,6 @@ def test_noise_alone_is_no_texture_and_twice_the_noise_is(level):
     assert ASKED.enough(*moments).mean() > 0.99
 
 
-def test_moments_are_those_of_the_window():
-    image = np.random.default_rng(0).integers(0, 256, (30, 31)).astype(np.uint8)
-    mean, variance = window_moments(image, 5)
-    part = image[10:15, 7:12].astype(float)
-    assert mean[12, 9] == pytest.approx(part.mean(), rel=1e-5)
-    assert variance[12, 9] == pytest.approx(part.var(), rel=1e-3)
-
-
 def test_a_dim_pair_with_dots_matches_and_a_bright_one_without_does_not():
     """A threshold of grey values does the opposite."""
     rng = np.random.default_rng(1)
@@ -71,10 +63,3 @@ def test_an_amplified_picture_is_judged_by_its_own_noise():
     assert asked.at(camera.noise(80.0)).enough(*moments).mean() < 0.02
     of_preset = for_picture(CensusMatcher(texture=asked), camera.noise(80.0))
     assert of_preset.texture == asked.at(GreyNoise(camera.electrons_at_white / 8, 10.0))
-
-
-def test_what_was_set_stays():
-    noise = GreyNoise(500.0, 5.0)
-    assert ASKED.at(noise) == ASKED
-    plain = CensusMatcher()
-    assert for_picture(plain, noise) is plain

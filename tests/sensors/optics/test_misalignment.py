@@ -34,15 +34,6 @@ def test_fields_shift_the_right_picture_alone_by_their_rms():
     assert abs(np.corrcoef(along.ravel(), again.ravel())[0, 1]) < 0.2
 
 
-def test_a_part_of_the_picture_is_shifted_as_it_is_in_the_whole():
-    lens = Misalignment(rows_px=0.5, columns_px=0.5, cell_px=40.0)
-    part = Window(60, 50, 90, 70)
-    for ramp in ramps():
-        whole = lens.seen(ramp, WHOLE, K)[50:120, 60:150]
-        alone = lens.seen(np.ascontiguousarray(ramp[50:120, 60:150]), part, K)
-        np.testing.assert_allclose(middle(whole), middle(alone), atol=0.02)
-
-
 def test_columns_that_do_not_meet_are_a_bias_of_the_depth(renderer):
     """A field that hardly changes over the plane: the same shift everywhere on it."""
     sensor = SpeckleStereo()

@@ -18,15 +18,6 @@ def test_missing_bpy_says_what_to_install(monkeypatch):
         BlenderRenderer()
 
 
-def test_nothing_is_left_in_blender():
-    import bpy
-
-    renderer = BlenderRenderer(samples=1)
-    renderer.render(busy_scene(), [busy_camera()], seed=0, geometry=[True])
-    for kind in ("objects", "meshes", "materials", "lights", "cameras", "images", "worlds"):
-        assert len(getattr(bpy.data, kind)) == 0
-
-
 def test_failure_inside_blender_is_reported(monkeypatch):
     def fail(*_args):
         raise RuntimeError("Error: cannot save")

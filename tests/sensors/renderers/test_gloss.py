@@ -73,15 +73,6 @@ def test_nothing_reflects_more_than_it_gets(albedo, roughness, specular, cosine,
     assert 0 <= reflected(albedo, gloss, cosine) <= 1.005
 
 
-def test_facing_mirrors_reflect_eight_hundredths_of_specular_and_metals_their_albedo():
-    for gloss, share in ((Gloss(0.5, 1.0), 0.08), (Gloss(0.5, 0.25), 0.02)):
-        # pi D V at normal incidence is 1 / (4 alpha^2), the Lambertian part keeps the rest
-        got = times_pi(0.6, gloss, UP, UP, UP) - 0.6 * (1 - kept_back(gloss)[-1])
-        assert got == pytest.approx(share / (4 * 0.5**4))
-    assert times_pi(0.6, Gloss(0.5, metal=True), UP, UP, UP) == pytest.approx(0.6 / (4 * 0.5**4))
-    assert Gloss(specular=0.5).refractive_index == pytest.approx(1.5)
-
-
 # --- Mitsuba's kernel
 
 
@@ -173,25 +164,6 @@ def shiny_scene():
     scene = busy_scene()
     bodies = tuple(replace(b, gloss=g) for b, g in zip(scene.bodies, GLOSSES[:2], strict=True))
     return replace(scene, bodies=bodies, area=AreaLight(above(-1.0, 1.0), 1.0, 0.5))
-
-
-def test_window_is_a_crop_and_same_call_same_bytes(mitsuba):
-    camera, window = (
-        Camera(Intrinsics(96, 80, 90.0, 45.3, 41.8), moved(0.02)),
-        Window(31, 17, 40, 32),
-    )
-    part = replace(camera, window=window)
-    mitsuba.settings = RendererSettings(samples=16)
-
-    def render(camera, seed):
-        (image,) = mitsuba.render(shiny_scene(), [camera], seed=seed, geometry=[False])
-        return image.radiance
-
-    whole = render(camera, seed=3)
-    assert np.abs(render(part, seed=3) - whole[window.slices]).max() < 0.6  # noise of dots' edges
-    mitsuba.settings = RendererSettings(samples=16, threads=2)
-    np.testing.assert_array_equal(render(camera, seed=3), whole)
-    assert (render(camera, seed=4) != whole).any()
 
 
 def test_the_variant_without_a_compiler_refuses_and_names_the_settings():

@@ -76,11 +76,6 @@ def test_a_wall_gets_the_light_of_another_as_an_integral_says(mitsuba):
         assert around == pytest.approx(by_quadrature(column, row, 0.8), rel=0.05)
 
 
-def test_the_light_between_falls_with_both_albedos(mitsuba):
-    dark, bright = (indirect(mitsuba, corner(albedo)).mean() for albedo in (0.4, 0.8))
-    assert bright / dark == pytest.approx(4, rel=0.02)
-
-
 # Blender's dots light in spots, which leaves it noise; ours have the slide's mean.
 @pytest.mark.parametrize(
     ("slide", "alike"),
@@ -120,24 +115,6 @@ def test_through_a_clear_sheet_the_wall_is_seen_in_light_that_came_through(mitsu
         assert (middle_of(image.label) == 3).all()  # the truth is the sheet's
         np.testing.assert_allclose(middle_of(image.depth_m), 1.0, rtol=1e-5)
         assert image.radiance[50, 5] == pytest.approx(albedo * (ambient + 1 / BACK_M**2), rel=0.01)
-
-
-@pytest.mark.parametrize("count", [1, pytest.param(6, marks=pytest.mark.slow)])
-def test_behind_sheets_there_may_be_nothing(count, mitsuba, blender):
-    """Each adds a share of its own light, which those before it hold back; then it is dark."""
-    t, ambient, albedo = 0.8, 0.5, 0.6
-    places = [1.0 + 0.1 * i for i in range(count)]
-    scene = Scene(tuple(sheet(t, albedo, z, 0.2 * z, 3) for z in places), projector(), ambient)
-    unlit = replace(scene, projector=None)
-    own = [(1 - t) * albedo * t**i for i in range(count)]
-    for renderer in (mitsuba, blender):
-        lit, even = (
-            renderer.render(one, [CAMERA], seed=0, geometry=[False])[0].radiance
-            for one in (scene, unlit)
-        )
-        assert middle_of(even).mean() == pytest.approx(ambient * sum(own), rel=0.02)
-        dots = sum(a * t**i / z**2 for i, (a, z) in enumerate(zip(own, places, strict=True)))
-        assert middle_of(lit - even).mean() == pytest.approx(dots, rel=0.02)
 
 
 @pytest.mark.slow

@@ -59,12 +59,3 @@ def test_whatever_the_processor_would_take(renderer, monkeypatch, width):
     if width == 16 and has_avx512():  # else Embree takes eight twice, and there is nothing to fix
         assert (other.radiance != before.radiance).any()
     assert "width" not in renderer.provenance()
-
-
-def test_where_drjit_cannot_be_asked_the_dataset_says_so(renderer, monkeypatch):
-    with monkeypatch.context() as patched:
-        patched.setattr(llvm, "_library", lambda: None)
-        rendered(renderer)
-        assert renderer.provenance()["width"] == "unknown"
-    rendered(renderer)
-    assert "width" not in renderer.provenance()
