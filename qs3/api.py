@@ -38,7 +38,7 @@ def train(*overrides: str) -> Path:
     from omegaconf import OmegaConf
 
     from qs3.errors import ConfigError
-    from qs3.runs.unbegun import removed_if_unbegun
+    from qs3.runs.folder import removed_if_unbegun
     from qs3.training.command import train as trained
     from qs3.training.run import run_of
     from qs3.utils.files import write_text

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from qs3.config.hydra import cli_errors, in_multirun
 from qs3.config.location import CONF
-from qs3.runs.unbegun import removed_if_unbegun
+from qs3.runs.folder import removed_if_unbegun
 from qs3.utils.commands import hydra_command
 
 

@@ -21,8 +21,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.evaluation.calibration import calibration_error
 from qs3.kernels.norms import adapt_batchnorm, use_trained
 from qs3.runs.metrics import PseudoLabelScores, Scores
-from qs3.runs.predictions import Predictions
-from qs3.runs.pseudo_labels import read_pseudo_labels
+from qs3.runs.predictions import Predictions, read_pseudo_labels
 
 
 def predict(

@@ -21,8 +21,13 @@ from qs3.errors import DataError, MissingDataError
 from qs3.runs import folder as runs
 from qs3.runs.metrics import METRICS, RoundRecord, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE as PREDICTIONS
-from qs3.runs.predictions import Predictions, read_predictions
-from qs3.runs.pseudo_labels import PseudoLabel, path_of, read_pseudo_labels
+from qs3.runs.predictions import (
+    Predictions,
+    PseudoLabel,
+    pseudo_labels_path,
+    read_predictions,
+    read_pseudo_labels,
+)
 from qs3.store.store import PointSet, is_finished
 
 if TYPE_CHECKING:
@@ -119,8 +124,8 @@ def read_run(folder: str | Path) -> RunFiles:
     records = {record.round: record for record in (metrics.rounds if metrics else [])}
     found = (re.fullmatch(r"round_(\d+)", path.name) for path in folder.glob("round_*"))
     numbers = {int(match[1]) for match in found if match}
-    tables = {n: read_pseudo_labels(path_of(folder, n)) for n in numbers
-              if path_of(folder, n).is_file()}  # fmt: skip
+    tables = {n: read_pseudo_labels(pseudo_labels_path(folder, n)) for n in numbers
+              if pseudo_labels_path(folder, n).is_file()}  # fmt: skip
     rounds = tuple(Round(n, records.get(n), tables.get(n)) for n in sorted({*records, *tables}))
     if predictions is not None:
         classes = predictions.classes

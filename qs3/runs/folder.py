@@ -1,4 +1,4 @@
-"""A run's folder: its name, its lock, and whether it is finished. Imports nothing heavy.
+"""A run's folder: its name, and whether it is begun or finished. Imports nothing heavy.
 
 A run is named by its experiment, its seed and a hash of its config, so the same command always
 finds its own folder: it continues an unfinished run, and skips a finished one. `metrics.json` is
@@ -24,70 +24,48 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs.metrics import METRICS
 from qs3.utils.files import write_json
-from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.locks import owned
 
 STARTED = "started.json"
+ANEW = "choose another experiment_name, or start again with force=true"
+"""What to do about a run that cannot be continued."""
 
 _KEPT_WHEN_CLEARED = (".hydra", ".lock")
+_OF_A_START = ("train.log", ".lock", STARTED, ".hydra")
 
 
 def read_started(folder: str | Path) -> dict[str, Any] | None:
-    """What `write_started` saved; None if the run never got that far."""
-    path = Path(folder) / STARTED
-    try:
-        started = json.loads(read_whole(path, JSON_PEAK))
-        if not isinstance(started, dict):
-            raise ValueError("no JSON object")
-        return started
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path} cannot be read ({error}); delete it or run with force=true") from (
-            error
-        )
-
-
-def read_begun(folder: str | Path) -> dict[str, Any] | None:
-    """As `read_started`, of a run, which has to say what it was trained on.
+    """What `write_started` saved; None if the run never got that far.
 
     Raises:
-        DataError: it does not.
+        DataError: the file is damaged.
     """
-    started = read_started(folder)
-    if started is not None:
-        data, versions = started.get("data"), started.get("versions")
-        said = isinstance(data, dict) and {*data} >= {"source", "target"}
-        if not said or not isinstance(versions, dict):
-            raise DataError(
-                f"{Path(folder) / STARTED} cannot be read (nothing of data and versions); delete "
-                "it or run with force=true"
-            )
-    return started
+    path = Path(folder) / STARTED
+    try:
+        return dict(json.loads(path.read_bytes()))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise DataError(f"{path} cannot be read ({error}); run with force=true") from error
 
 
 def read_code(folder: str | Path) -> dict[str, str]:
-    """Hashes of the code that a run was begun with, by name; {} where nobody knows."""
+    """Hashes of the code that a run was begun with, by name; {} where it is not known."""
     with contextlib.suppress(DataError):
-        found = (read_started(folder) or {}).get("files")
-        if isinstance(found, dict):
-            return {str(name): str(sha256) for name, sha256 in found.items()}
+        return dict((read_started(folder) or {}).get("files") or {})
     return {}
 
 
 def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:
     """Note what a run was started with, so that it is never continued with something else."""
     write_json(Path(folder) / STARTED, started)
-
-
-ANEW = "choose another experiment_name, or start again with force=true"
-"""What to do about a run that cannot be gone on with."""
 
 
 def check_data(folder: Path, domain: str, expected: str, found: str, instead: str = ANEW) -> None:
@@ -116,11 +94,6 @@ def check_config(folder: Path, expected: str | None, found: str, instead: str = 
         )
 
 
-def beside(name: str) -> str:
-    """What twins and views are called in messages."""
-    return f"what lies beside {name}"
-
-
 def clear(folder: str | Path) -> None:
     """Delete what an earlier run left, except what Hydra has just written there."""
     folder = Path(folder)
@@ -133,3 +106,19 @@ def clear(folder: str | Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink()
+
+
+@contextlib.contextmanager
+def removed_if_unbegun(folder: Path) -> Iterator[None]:
+    """After an error of ours in the block, remove a folder that holds nothing but its start.
+
+    Hydra makes the folder before anything is checked.
+    """
+    try:
+        yield
+    except Qs3Error:
+        with contextlib.suppress(Qs3Error, OSError), owned(folder):  # another process may train
+            if {path.name for path in folder.iterdir()} <= {*_OF_A_START}:
+                shutil.rmtree(folder)
+                folder.parent.rmdir()  # if nothing else is in it
+        raise

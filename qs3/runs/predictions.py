@@ -1,15 +1,16 @@
-"""`predictions.csv`: a run's predictions for the target's evaluated clouds, one row each.
+"""A run's predictions on disk, as CSV.
 
-Columns: id; mesh (hash of the object's mesh: scans of one mesh are not independent samples; of
-objects of frames their room, or their block of frames; the id where neither is known); label (empty
-if nobody knows it); predicted; tier ("clean" or "hard", where the dataset has tiers: else there is
-no such column); and a probability per class.
+predictions.csv, of the target's evaluated clouds: id; mesh (hash of the object's mesh: scans of one
+mesh are not independent samples; of objects of frames their room, or their block of frames; the id
+where neither is known); label (empty if it is not known); predicted; tier ("clean" or "hard", where
+the dataset has tiers: else there is no such column); and a probability per class.
+
+round_03/pseudo_labels.csv, of a round's target clouds: id, label, confidence, selected.
 """
 
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,14 +20,13 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.errors import DataError
 from qs3.utils.files import write_text
-from qs3.utils.memory import TABLE_PEAK, read_whole
 from qs3.utils.text_table import csv_text
 
 FILE = "predictions.csv"
 OF_FILES = "predictions_of_files.csv"
 _FIRST = ("id", "mesh", "label", "predicted")
 _TIER = "tier"
-_ONE = 1.001  # sums in float32
+_PSEUDO_LABELS = ("id", "label", "confidence", "selected")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class Predictions:
         ids: unique.
         meshes: cluster of each cloud.
         labels: [n] true classes; -1 where unknown.
-        probabilities: [n, C] in [0, 1].
-        tiers: how much of its object each cloud shows; empty where nobody knows.
+        probabilities: [n, C] in [0, 1]; nan of a net that has diverged.
+        tiers: how much of its object each cloud shows; empty where it is not known.
     """
 
     classes: tuple[str, ...]
@@ -83,7 +83,7 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
 def write_predictions_of_files(
     path: Path, files: Sequence[str], reasons: Sequence[str], predictions: Predictions
 ) -> None:
-    """A table for whoever owns the files: one row each, in the order of their names.
+    """A table for the owner of the files: one row each, in the order of their names.
 
     Columns: file; class; confidence; unlike_source (yes or no), reason (in what it is unlike the
     source's; "" if in nothing); and a probability per class, to four digits.
@@ -102,19 +102,12 @@ def read_predictions(path: Path) -> Predictions:
     """Read the table.
 
     Raises:
-        DataError: it is not there, or not as `write_predictions` writes it.
+        DataError: it is not there, or damaged.
     """
+    header, rows = _read(path)
     try:
-        text = read_whole(path, TABLE_PEAK).decode()
-        header, *rows = list(csv.reader(io.StringIO(text, newline="")))
-        first = len(_FIRST) + (header[len(_FIRST) :][:1] == [_TIER])
+        first = len(_FIRST) + (_TIER in header[: len(_FIRST) + 1])
         classes = tuple(name.removeprefix("p_") for name in header[first:])
-        if tuple(header[: len(_FIRST)]) != _FIRST or not classes or not rows:
-            raise ValueError("it has other columns, or no rows")
-        if len(set(classes)) < len(classes) or len({row[0] for row in rows}) < len(rows):
-            raise ValueError("a class or an id occurs twice")
-        if {len(row) for row in rows} != {len(header)}:
-            raise ValueError("a row has more or fewer cells than columns")
         found = Predictions(
             classes,
             tuple(row[0] for row in rows),
@@ -123,14 +116,69 @@ def read_predictions(path: Path) -> Predictions:
             np.array([[float(cell) for cell in row[first:]] for row in rows]),
             tuple(row[len(_FIRST)] for row in rows) if first > len(_FIRST) else (),
         )
-        unknown = np.isnan(found.probabilities)  # of a net that diverged, whole rows
-        shares = (found.probabilities >= 0) & (found.probabilities <= _ONE)
-        if not (shares | unknown.all(axis=1, keepdims=True)).all():
-            raise ValueError("a probability is not in [0, 1]")
         if [classes.index(row[3]) for row in rows] != found.predicted.tolist():
             raise ValueError("what is predicted is not the most probable class")
+        if len({*found.ids}) < len(rows):
+            raise ValueError("an id occurs twice")
         return found
-    except (OSError, ValueError, IndexError, csv.Error) as error:
+    except (ValueError, IndexError) as error:
+        raise DataError(f"{path} is damaged ({error}); repeat the run with force=true") from error
+
+
+@dataclass(frozen=True)
+class PseudoLabel:
+    """One row: the predicted class's name and probability, and whether it is trained on."""
+
+    id: str
+    label: str
+    confidence: float
+    selected: bool
+
+
+def pseudo_labels_path(folder: Path, round_: int) -> Path:
+    """Where the pseudo-labels of a round lie in a run's folder."""
+    return folder / f"round_{round_:02d}" / "pseudo_labels.csv"
+
+
+def write_pseudo_labels(
+    path: Path,
+    ids: Sequence[str],
+    predicted: np.ndarray,
+    confidence: np.ndarray,
+    selected: np.ndarray,
+    classes: Sequence[str],
+) -> None:
+    """Write the table, atomically; confidences with all their digits."""
+    rows = zip(ids, predicted, confidence, selected, strict=True)
+    lines = ([id_, classes[label], float(p), int(kept)] for id_, label, p, kept in rows)
+    write_text(path, csv_text([_PSEUDO_LABELS, *lines]))
+
+
+def read_pseudo_labels(path: Path) -> list[PseudoLabel]:
+    """Read the table.
+
+    Raises:
+        DataError: it is not there, or damaged.
+    """
+    _, rows = _read(path)
+    try:
+        return [
+            PseudoLabel(id_, label, float(confidence), {"0": False, "1": True}[selected])
+            for id_, label, confidence, selected in rows
+        ]
+    except (ValueError, KeyError) as error:
+        raise DataError(f"{path} is damaged ({error}); repeat the run with force=true") from error
+
+
+def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a CSV file, all of one length."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            header, first, *rows = csv.reader(file, strict=True)
+    except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} cannot be read ({error}); repeat the run with force=true") from (
             error
         )
+    if any(len(row) != len(header) for row in (first, *rows)):
+        raise DataError(f"{path} is damaged; repeat the run with force=true")
+    return header, [first, *rows]

@@ -37,7 +37,7 @@ from qs3.evaluation.metrics import global_features, predict
 from qs3.kernels.norms import begin_target_norms
 from qs3.runs.checkpoints import copy_weights, load, save
 from qs3.runs.metrics import RoundRecord
-from qs3.runs.pseudo_labels import path_of, write_pseudo_labels
+from qs3.runs.predictions import pseudo_labels_path, write_pseudo_labels
 from qs3.selftraining.selectors import (
     Selection,
     TeacherPredictions,
@@ -163,7 +163,7 @@ class SelfTraining(Callback):
             selection = keep_all(selection, teacher.predicted)
         if trainer.is_global_zero:
             write_pseudo_labels(
-                path_of(self.folder, round_),
+                pseudo_labels_path(self.folder, round_),
                 teacher.ids,
                 teacher.predicted,
                 teacher.confidence,

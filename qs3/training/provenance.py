@@ -52,7 +52,7 @@ def note_start(
         remove_leftovers(folder)
     if run.cfg.data.cache_dir:
         remove_old_leftovers(Path(run.cfg.data.cache_dir))
-    started = runs.read_begun(run.folder)
+    started = runs.read_started(run.folder)
     if started is not None:
         compare(run.folder, started, now)
         if (run.folder / LAST).is_file():

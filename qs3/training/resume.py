@@ -65,7 +65,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
     if path is None:
         return dict(started)
     other = path.resolve().parent
-    begun = runs.read_begun(other)
+    begun = runs.read_started(other)
     if begun is None or other.name != run.folder.name:  # named by seed and hash of the settings
         raise MissingDataError(f"ckpt_path={run.cfg.ckpt_path}: not the folder of this run")
     compare(other, begun, started)

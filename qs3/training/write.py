@@ -29,8 +29,12 @@ from qs3.runs.metrics import (
     Warmup,
 )
 from qs3.runs.predictions import FILE as PREDICTIONS
-from qs3.runs.predictions import OF_FILES, write_predictions, write_predictions_of_files
-from qs3.runs.pseudo_labels import path_of
+from qs3.runs.predictions import (
+    OF_FILES,
+    pseudo_labels_path,
+    write_predictions,
+    write_predictions_of_files,
+)
 from qs3.store.manifest import read_manifest
 from qs3.training.build import Built
 from qs3.training.evaluate import Outcome
@@ -94,7 +98,9 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
         rounds=[
             replace(
                 record,
-                with_target_labels=evaluation.pseudo_labels(path_of(run.folder, record.round)),
+                with_target_labels=evaluation.pseudo_labels(
+                    pseudo_labels_path(run.folder, record.round)
+                ),
             )
             for record in built.rounds.records
         ],

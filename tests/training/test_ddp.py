@@ -20,7 +20,7 @@ from qs3.datamodules.clouds import load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.tent import minimise_entropy
 from qs3.runs.checkpoints import load
-from qs3.runs.pseudo_labels import write_pseudo_labels
+from qs3.runs.predictions import write_pseudo_labels
 from qs3.selftraining.selectors import Qbst, TeacherPredictions
 from qs3.store.store import open_pointset
 from qs3.training.command import train

@@ -13,8 +13,7 @@ import torch
 
 from qs3.config import hashing
 from qs3.runs.metrics import RunMetrics
-from qs3.runs.predictions import read_predictions
-from qs3.runs.pseudo_labels import path_of, read_pseudo_labels
+from qs3.runs.predictions import pseudo_labels_path, read_predictions, read_pseudo_labels
 from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from qs3.training.command import train
 from tests.training.toy import CLASSES, CONF, toy_config, write_toy
@@ -109,7 +108,7 @@ def test_same_weights_predictions_and_estimates(data, tmp_path, case) -> None:
     for record in ours.rounds:
         rows = [
             [(row.label, row.confidence, row.selected) for row in read_pseudo_labels(path)]
-            for path in (path_of(folder, record.round) for folder in (one, two))
+            for path in (pseudo_labels_path(folder, record.round) for folder in (one, two))
         ]
         assert rows[0] == rows[1]
     assert (ours.quality, ours.validators) == (theirs.quality, theirs.validators)

@@ -16,7 +16,7 @@ from qs3.datamodules.clouds import Clouds, load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import RunMetrics
-from qs3.runs.pseudo_labels import path_of, read_pseudo_labels
+from qs3.runs.predictions import pseudo_labels_path, read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
 from qs3.store.store import open_pointset
 from qs3.training.command import train
@@ -83,7 +83,7 @@ def test_a_round_says_how_many_labels_it_kept_from_the_round_before(run, request
     found = request.getfixturevalue(run)
     assert found.metrics.rounds[0].agreement is None
     labels = [
-        [row.label for row in read_pseudo_labels(path_of(found.folder, round_))]
+        [row.label for row in read_pseudo_labels(pseudo_labels_path(found.folder, round_))]
         for round_ in range(2)
     ]
     kept = [a == b for a, b in zip(*labels, strict=True)]
@@ -129,7 +129,7 @@ def test_continued_students_begin_with_their_teacher(continued: Kept) -> None:
 def test_a_share_of_the_target_exceeds_each_round_s_threshold(continued: Kept) -> None:
     """`selftraining.share`: theta by the predictions of the round, whatever they are."""
     for record in continued.metrics.rounds:
-        table = read_pseudo_labels(path_of(continued.folder, record.round))
+        table = read_pseudo_labels(pseudo_labels_path(continued.folder, record.round))
         said = torch.tensor([row.confidence for row in table], dtype=torch.float64)
         assert record.theta == pytest.approx(said.quantile(0.4).item())
         assert record.total_selected == (said > record.theta).sum() == round(0.6 * len(said))

@@ -24,8 +24,7 @@ from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.evaluation.validators import LABEL_FREE, hold_out
 from qs3.runs.checkpoints import copy_weights, load
 from qs3.runs.metrics import RunMetrics, read_metrics
-from qs3.runs.predictions import OF_FILES
-from qs3.runs.pseudo_labels import read_pseudo_labels
+from qs3.runs.predictions import OF_FILES, read_pseudo_labels
 from qs3.selftraining.student_selection import StudentSelection
 from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from qs3.training.command import headline, train
