@@ -1,16 +1,15 @@
 """The kernels of `qs3.kernels.edge_norm`. Imported where Triton is, and there is a GPU.
 
-Each function takes and gives what the operation of its name there does, in float32.
+Each function takes and gives, in float32, what the operation of its name there does.
 """
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from qs3.kernels.device import ROWS
 
@@ -60,9 +59,8 @@ def _extremes(
     tl.store(part + tl.num_programs(0).to(tl.int64) * d, squares, mask=a_channel)
 
 
-def edge_extremes(
-    pr: Tensor, index: Tensor, gamma: Tensor, pivot: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+@no_type_check
+def edge_extremes(pr, index, gamma, pivot):
     """The extreme edges of each point, and what the statistics of all need."""
     (rows, k), d = index.shape, len(gamma)
     blocks = triton.cdiv(rows, ROWS)
@@ -70,7 +68,7 @@ def edge_extremes(
     taken = torch.empty(rows, d, dtype=torch.uint8, device=pr.device)
     parts = pr.new_empty(2, blocks, d)
     grid = (blocks, triton.cdiv(d, _FEW_CHANNELS))
-    settings: dict[str, Any] = {"ROWS": ROWS, "CHANNELS": _FEW_CHANNELS, "num_warps": 4}
+    settings = {"ROWS": ROWS, "CHANNELS": _FEW_CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(pr):
         _extremes[grid](
             pr, index, gamma, pivot, best, taken, sums, own, parts, rows, d, k, **settings
@@ -110,22 +108,14 @@ def _output(
     tl.store(constants + 4 * d + channel, off, mask=keeps)
 
 
-def edge_output(
-    best: Tensor,
-    sums: Tensor,
-    pivot: Tensor,
-    gamma: Tensor,
-    beta: Tensor,
-    edges: int,
-    eps: float,
-    negative_slope: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+@no_type_check
+def edge_output(best, sums, pivot, gamma, beta, edges, eps, negative_slope):
     """The layer's output, from the extremes and the sums over all edges."""
     rows, d = best.shape
     y, t = best.new_empty(2, rows, d).unbind(0)
     constants = best.new_empty(5, d)
     grid = (triton.cdiv(rows, ROWS), triton.cdiv(d, _CHANNELS))
-    settings: dict[str, Any] = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
+    settings = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(best):
         _output[grid](
             best, sums, pivot, gamma, beta, y, t, constants, rows, d, edges, eps, negative_slope,
@@ -156,15 +146,14 @@ def _output_gradient(
     tl.store(part + tl.num_programs(0).to(tl.int64) * d, of_gamma, mask=a_channel)
 
 
-def edge_output_gradient(
-    grad: Tensor, y: Tensor, t: Tensor, constants: Tensor, negative_slope: float
-) -> tuple[Tensor, Tensor]:
+@no_type_check
+def edge_output_gradient(grad, y, t, constants, negative_slope):
     """The gradient before LeakyReLU, and parts of the norm's."""
     rows, d = y.shape
     blocks = triton.cdiv(rows, ROWS)
     du, parts = torch.empty_like(y), y.new_empty(2, blocks, d)
     grid = (blocks, triton.cdiv(d, _CHANNELS))
-    settings: dict[str, Any] = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
+    settings = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(y):
         _output_gradient[grid](
             grad, y, t, constants, du, parts, rows, d, negative_slope, **settings
@@ -216,22 +205,13 @@ def _gradient(
     tl.store(out + row * (2 * d) + d + channel, dq, mask=a_channel)
 
 
-def edge_gradient(
-    pr: Tensor,
-    own: Tensor,
-    du: Tensor,
-    taken: Tensor,
-    sums: Tensor,
-    first: Tensor,
-    order: Tensor,
-    constants: Tensor,
-    of_norm: Tensor,
-) -> Tensor:
+@no_type_check
+def edge_gradient(pr, own, du, taken, sums, first, order, constants, of_norm):
     """The gradient of P and R."""
     rows, d = du.shape
     out = torch.empty_like(pr)
     grid = (rows, triton.cdiv(d, _CHANNELS))
-    settings: dict[str, Any] = {"EDGES": _EDGES, "CHANNELS": _CHANNELS, "num_warps": 1}
+    settings = {"EDGES": _EDGES, "CHANNELS": _CHANNELS, "num_warps": 1}
     with torch.cuda.device_of(pr):
         _gradient[grid](
             pr, own, du, taken, sums, first, order, constants, of_norm, out,

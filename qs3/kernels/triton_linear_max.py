@@ -5,12 +5,11 @@ Each function takes and gives what the operation of its name there does, in floa
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from qs3.kernels.device import ROWS
 
@@ -39,15 +38,14 @@ def _points(
     tl.store(out + row.to(tl.int64) * c + channel, whole, mask=a_channel)
 
 
-def points_gradient(
-    grad: Tensor, weight: Tensor, beside: Tensor, first: Tensor, order: Tensor
-) -> Tensor:
+@no_type_check
+def points_gradient(grad, weight, beside, first, order):
     """The gradient of the points."""
     (d, c), (b, wide), n = weight.shape, grad.shape, first.shape[1] - 1
     out = weight.new_empty(b, n, c)
     channels = min(_OF_A_POINT, triton.next_power_of_2(c))
     grid = (b * n, triton.cdiv(c, channels))
-    settings: dict[str, Any] = {"CHANNELS": channels, "num_warps": 1}
+    settings = {"CHANNELS": channels, "num_warps": 1}
     with torch.cuda.device_of(weight):
         _points[grid](grad, weight, beside, first, order, out, n, c, d, wide, **settings)
     return out
@@ -74,12 +72,13 @@ def _weights(
     tl.store(out + place, whole, mask=here)
 
 
-def weight_gradient(grad: Tensor, x: Tensor, where: Tensor, base: Tensor) -> Tensor:
+@no_type_check
+def weight_gradient(grad, x, where, base):
     """The gradient of W."""
     (b, n, c), d = x.shape, len(base)
     out = torch.empty_like(base)
     grid = (triton.cdiv(d, ROWS), triton.cdiv(c, _CHANNELS))
-    settings: dict[str, Any] = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
+    settings = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(x):
         _weights[grid](grad, x, where, base, out, b, n, c, d, grad.shape[1], **settings)
     return out

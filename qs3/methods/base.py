@@ -54,11 +54,7 @@ class Method(nn.Module):
         """
 
     def start_epoch(self, net: nn.Module, data: AdaptationData, epoch: int, epochs: int) -> None:
-        """What is done before an epoch of the warm-up (of `epochs`), with the clouds as they are.
-
-        What it leaves for later epochs must lie in buffers: a checkpoint holds them, and of several
-        processes the first one's count.
-        """
+        """Prepare an epoch of the warm-up (of `epochs`); what it leaves must lie in buffers."""
 
     def learning_rates(self, net: nn.Module) -> Sequence[tuple[nn.Module, float]]:
         """Modules that learn at another rate than `protocol.optimizer.lr`, and its factors."""

@@ -55,12 +55,9 @@ class PointDan(Method):
     enlarge it, and R, gradient reversal by sin(p pi / 2), lets the generator lower it.
 
     One step for all losses. The released code takes two steps a batch, with three optimisers: one
-    for the first two terms (generator without the nodes' offset, at lr 1e-4; classifiers at
-    2e-4), then, after new forward passes, one for the third (generator and attentions, at a rate
-    that halves every five epochs, and jumps up again at epoch 31). Adam makes the size of a step
-    independent of the size of a loss, so there the third term weighs as much as the others
-    whatever its size; here its gradient is added. The offset of the nodes learns from all three
-    terms, as in the released code, where that is because nobody empties its gradient.
+    for the first two terms, then, after new forward passes, one for the third. Adam makes the size
+    of a step independent of the size of a loss, so there the third term weighs as much as the
+    others whatever its size; here its gradient is added.
 
     Args:
         class_weight: w_c; 1, in the authors' scripts 0.5 for three of the six pairs.

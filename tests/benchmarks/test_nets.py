@@ -6,11 +6,8 @@ The figures of docs/reference/{backbones,accelerators}.md and docs/how-to/leader
 from __future__ import annotations
 
 import copy
-import subprocess
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -167,9 +164,9 @@ def test_methods(capsys: pytest.CaptureFixture) -> None:
 
     def step(case: Case, net: Any) -> Step:
         torch.manual_seed(0)
-        method = case.make()
+        method, net = case.make(), net.float().train().to(DEVICE)
         method.prepare(net)
-        net, method = net.float().train().to(DEVICE), method.to(DEVICE)
+        method = method.to(DEVICE)
         b, n = (16, POINTS) if ENABLED else (2, 64)
         batch = batch_of(case, method, b, n, 5, DEVICE.type)
         generator = torch.Generator(DEVICE).manual_seed(0)
@@ -215,42 +212,12 @@ def test_clouds_a_second(capsys: pytest.CaptureFixture) -> None:
     rows.append("|---|---|---|---|")
     for name in NETS:
         net = build(name).float().to(DEVICE)
-        found = [b / seconds(net_step(net, points, way), 3 if ENABLED else 1) for way in (1, 0)]
+        found = [
+            b / seconds(net_step(net, points, way), 3 if ENABLED else 1) for way in (True, False)
+        ]
         rows.append(f"| {name} | {found[0]:,.1f} | {found[1]:,.1f} | {PUBLISHED.get(name, '-')} |")
     if ENABLED:
         show(capsys, *rows)
-
-
-PEAK = """
-import re, sys
-from pathlib import Path
-from tests.benchmarks.test_nets import boxes, build, net_step, NaiveDGCNN
-
-def peak():  # kB; ru_maxrss would begin with the parent's
-    return int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
-
-net = build("dgcnn").float()
-net = NaiveDGCNN(net) if sys.argv[1] == "straight" else net
-net_step(net, boxes(2, 32))()  # loads all libraries
-before = peak()
-net_step(net, boxes(int(sys.argv[2]), int(sys.argv[3])))()
-print(peak() - before)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc/self/status")
-def test_dgcnn_s_memory(capsys: pytest.CaptureFixture) -> None:
-    """What a training step adds to a process's peak."""
-    b, n = (4, 1024) if ENABLED else (2, 256)
-    found = []
-    for side in ("ours", "straight"):
-        command = [sys.executable, "-W", "ignore", "-c", PEAK, side, str(b), str(n)]
-        root = Path(__file__).parents[2]
-        done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
-        found.append(int(done.stdout) / 1024)
-    assert found[0] < found[1] / 4
-    if ENABLED:
-        show(capsys, f"DGCNN {b} x {n}: a step adds {found[0]:.0f} MB, straight {found[1]:.0f}")
 
 
 def _graph_step(net: Any, points: torch.Tensor) -> Step:

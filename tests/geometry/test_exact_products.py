@@ -23,7 +23,7 @@ from qs3.methods.mlsp import cardinalities, normals_of
 from qs3.methods.pointdan import mmd2
 from tests.composing import compose
 from tests.device import as_on_device
-from tests.models.test_all_nets import NETS, build
+from tests.models.test_all_nets import build, each_net
 
 PRODUCTS = ("mm", "bmm", "addmm", "baddbmm", "mv", "dot", "_euclidean_dist")
 
@@ -83,7 +83,7 @@ def test_distances_and_turns_of_methods_are_exact() -> None:
         assert told.found
 
 
-@pytest.mark.parametrize("name", NETS)
+@each_net
 def test_nets_round_layers_but_no_coordinates(name: str) -> None:
     """Turned clouds stay exact, and distances; a first layer is a layer like others."""
     net = build(name, **({"variant": "defrec"} if name == "dgcnn" else {})).float().train()

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.geometry import neighbours
-from qs3.geometry.neighbours import farthest_point_sampling, gather, knn
+from qs3.geometry.neighbours import farthest_point_sampling, knn
 from qs3.kernels import compiled
 from tests.device import as_on_device
 from tests.geometry.test_sampling import assert_farthest
@@ -59,24 +59,9 @@ def test_knn_tree_and_dense_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     assert torch.equal(knn(x, 1), dense[:, :, :1])
 
 
-@pytest.mark.parametrize("block", [1, 5000, 100_000])
-def test_knn_in_blocks(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    x = torch.randn(4, 210, 5, dtype=torch.float64)
-    whole = knn(x, 6)
-    monkeypatch.setattr(neighbours, "_CPU_BLOCK", block)
-    assert torch.equal(knn(x, 6), whole)
-
-
 def test_knn_with_k_above_n_starts_over() -> None:
     x = torch.tensor([[[0.0], [1.0], [5.0]]])
     assert knn(x, 5).tolist() == [[[0, 1, 2, 0, 1], [1, 0, 2, 1, 0], [2, 1, 0, 2, 1]]]
-
-
-def test_knn_of_copies_and_nan_stays_in_range() -> None:
-    for x in (torch.zeros(2, 300, 3), torch.full((1, 300, 3), torch.nan)):
-        index = knn(x, 9)
-        assert index.min() >= 0
-        assert index.max() < 300
 
 
 def test_knn_far_from_origin_and_in_half_precision() -> None:
@@ -104,13 +89,6 @@ def test_knn_of_anything(n: int, k: int, seed: int, grid: bool) -> None:
         assert torch.equal(order[knn(x[:, order], k)], index[:, order])  # equivariant
 
 
-def test_gather() -> None:
-    x = torch.arange(12.0).view(2, 3, 2)
-    index = torch.tensor([[[0, 2]], [[1, 1]]])
-    assert gather(x, index).tolist() == [[[[0, 1], [4, 5]]], [[[8, 9], [8, 9]]]]
-    assert gather(x, index[:, 0]).shape == (2, 2, 2)
-
-
 def _on_device(*args: Any) -> torch.Tensor:
     with as_on_device():
         return farthest_point_sampling(*args)
@@ -132,8 +110,3 @@ def test_fps_batched(sample: object) -> None:
     copies = sample(torch.ones(2, 6, 3), 6, 2)
     assert copies[:, 0].tolist() == [2, 2]
     assert torch.equal(copies.sort(1)[0], torch.arange(6).expand(2, 6))
-
-
-def test_fps_paths_agree() -> None:
-    x = torch.randn(2, 150, 3)
-    assert torch.equal(farthest_point_sampling(x, 80, 3), _on_device(x, 80, 3))

@@ -5,8 +5,6 @@ from itertools import pairwise
 import fpsample
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from qs3.errors import DataError, MeshError
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample, unit_ball
@@ -67,13 +65,6 @@ def test_buckets_start_where_we_want(total: int, monkeypatch: pytest.MonkeyPatch
             assert farthest_point_sampling_np(points, 40, int(start))[0] == start
 
 
-def test_fps_falls_back_when_buckets_start_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = np.random.default_rng(2).standard_normal((200, 3))
-    expected = farthest_point_sampling_np(points, 50, 3)
-    monkeypatch.setattr("qs3.geometry.sampling._position_in_tree", lambda *_: 0)
-    np.testing.assert_array_equal(farthest_point_sampling_np(points, 50, 3), expected)
-
-
 def test_fps_of_one_repeated_point_and_of_too_few() -> None:
     same = np.ones((200, 3))
     assert farthest_point_sampling_np(same, 200, 5)[0] == 5
@@ -86,20 +77,6 @@ def test_fps_of_one_repeated_point_and_of_too_few() -> None:
 def test_fps_of_what_is_no_number() -> None:
     with pytest.raises(DataError):
         farthest_point_sampling_np(np.full((3, 3), np.nan), 2)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(2, 200), st.integers(0, 1000))
-def test_fps_coverage_shrinks_and_prefixes_agree(total: int, seed: int) -> None:
-    points = np.random.default_rng(seed).standard_normal((total, 3))
-    order = farthest_point_sampling_np(points, total)
-    nearest, radii = np.full(total, np.inf), []
-    for index in order:
-        nearest = np.minimum(nearest, np.square(points - points[index]).sum(1))
-        radii.append(nearest.max())
-    assert np.all(np.diff(radii) <= 0)
-    half = total // 2 + 1
-    np.testing.assert_array_equal(farthest_point_sampling_np(points, half), order[:half])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -56,43 +56,6 @@ def test_the_kth_smallest_is_that_of_sorted_rows(data, width, rows):
     np.testing.assert_array_equal(found, np.sort(x, axis=1)[:, k - 1])
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_values_are_torchs_whatever_the_threads_and_the_layout(monkeypatch, threads, dtype):
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    torch.manual_seed(0)
-    x = torch.randn(40, 300, dtype=dtype).T  # no row in one piece
-    index, grad = edges(300, 2000, 7), torch.randn(2000, 40, dtype=dtype)
-    best, where = compiled.neighbour_max(x, index)
-    assert torch.equal(best, x[index].amax(1))
-    assert torch.equal(best, x.gather(0, where.long()))
-    found = compiled.neighbour_max_backward(grad, where, 300)
-    expected = torch.zeros(300, 40, dtype=torch.float64)
-    expected.scatter_add_(0, where.long(), grad.double())
-    torch.testing.assert_close(found, expected.to(dtype), rtol=1e-4, atol=1e-5)
-    up = torch.randn(40, 2000, dtype=dtype).T
-    index = edges(2000, 2000, 7)
-    added = torch.zeros(2000, 40, dtype=torch.float64)
-    for j in range(7):
-        added.index_add_(0, index[:, j], up.double())
-    ours = compiled.add_to_neighbours(up, index)
-    torch.testing.assert_close(ours, added.to(dtype), rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_gradients_of_a_linear_layers_maxima(monkeypatch, threads):
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    torch.manual_seed(0)
-    x = torch.randn(3, 50, 40, dtype=torch.float64, requires_grad=True)
-    weight = torch.randn(70, 40, dtype=torch.float64, requires_grad=True)
-    best, where = (x @ weight.T).max(1)
-    grad = torch.randn(70, 3, dtype=torch.float64).T
-    expected = torch.autograd.grad(best, (x, weight), grad)
-    found = compiled.linear_max_backward(x, weight, grad, where)
-    for ours, theirs in zip(found, expected, strict=True):
-        torch.testing.assert_close(ours, theirs)
-
-
 def test_threads_move_no_bit(monkeypatch):
     torch.manual_seed(0)
     x, index = torch.randn(500, 64), edges(500, 4000, 20)

@@ -12,7 +12,6 @@ from torch import Tensor
 from qs3.kernels import linear_max
 from qs3.kernels.device import lists_of
 from tests.triton import in_interpreter, needs_triton
-from tests.unchecked import unchecked
 
 
 def _inputs(b: int, n: int, c: int, d: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -26,15 +25,6 @@ def test_values_and_gradients_are_those_of_the_layer() -> None:
     expected = torch.cat([y.amax(1), y.mean(1)], 1)
     torch.testing.assert_close(linear_max.pooled(x, weight), expected)
     assert torch.autograd.gradcheck(linear_max.pooled, (x, weight))
-
-
-def test_the_gradient_of_equal_points_goes_to_one() -> None:
-    x, weight = _inputs(1, 1, 3, 2, torch.float64)
-    x = x.expand(1, 4, 3).clone().requires_grad_()
-    linear_max.pooled(x, weight)[:, :2].sum().backward()
-    taken = x.grad[0].abs().sum(1) > 0
-    assert 1 <= taken.sum() <= 2  # each channel has its own
-    torch.testing.assert_close(x.grad.sum(1), weight.sum(0, keepdim=True))
 
 
 @pytest.mark.parametrize("rows", [5, 1 << 15, (1 << 16) - 1, 1 << 16])
@@ -61,20 +51,6 @@ def test_operations_are_as_torch_wants_them() -> None:
     grad, beside = torch.randn(2, 12), torch.randn(2, 4)
     torch.library.opcheck(linear_max.points_gradient, (grad, weight, beside, first, order))
     torch.library.opcheck(linear_max.weight_gradient, (grad, x, where, weight))
-
-
-@unchecked
-@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")  # torch's own
-def test_torchs_compiler_takes_them() -> None:
-    leaves = [t.requires_grad_() for t in _inputs(2, 9, 4, 6, torch.float32)]
-
-    def layer(x: Tensor, weight: Tensor) -> Tensor:
-        return linear_max.pooled(x, weight).square().sum()
-
-    expected = torch.autograd.grad(layer(*leaves), leaves)
-    compiled = torch.compile(layer, backend="aot_eager", fullgraph=True)
-    for ours, theirs in zip(torch.autograd.grad(compiled(*leaves), leaves), expected, strict=True):
-        torch.testing.assert_close(ours, theirs)
 
 
 # Channels that fill no block, a point that has many maxima, and gradients of more than the maxima.

@@ -8,10 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import linear_sum_assignment
 
 from qs3.methods.cpcm import Cpcm, angle, exchanged, tree_order
-from tests.methods.shapes import boxes, tiny_net
+from tests.methods.shapes import tiny_net
 from tests.methods.test_learning import compare, gain, strays
 
 
@@ -37,19 +36,6 @@ def test_tree_order_by_recursion(b: int, n: int, seed: int) -> None:
 
     expected = [ordered(cloud, 0) for cloud in points.tolist()]
     assert torch.equal(tree_order(points), torch.tensor(expected))
-
-
-def test_matches_are_near_those_of_the_exact_assignment() -> None:
-    """For clouds of different classes; at 1,024 points 1.1 to 1.3 times the least distance."""
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.arange(4)
-    first, second = boxes(labels, 256, generator), boxes(labels.flip(0), 256, generator)
-    ours = (tree_order(first) - tree_order(second)).norm(dim=2).mean(1)
-    for i in range(4):
-        distance = torch.cdist(first[i], second[i])
-        least = distance[linear_sum_assignment(distance.numpy())].mean()
-        assert least <= ours[i] < 1.5 * least
-        assert ours[i] < 0.6 * distance.mean()  # of any two points
 
 
 @settings(max_examples=40, deadline=None)

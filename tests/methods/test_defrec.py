@@ -1,9 +1,22 @@
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import nn
 
 from qs3.errors import ConfigError
-from qs3.methods.defrec import DefRec, ReconstructionHead, deform, masked_chamfer
+from qs3.methods.defrec import (
+    VOXELS,
+    DefRec,
+    ReconstructionHead,
+    cloud_size,
+    deform,
+    masked_chamfer,
+    voxel_centre,
+    voxel_of,
+)
+from qs3.methods.gast import Gast
+from qs3.methods.mlsp import Mlsp
 from qs3.models.base import Features
 from tests.methods.shapes import tiny_net
 
@@ -74,3 +87,126 @@ def test_a_model_without_features_per_point_is_refused() -> None:
     net.backbone.forward = lambda points: Features(per_cloud(points).global_, None)
     with pytest.raises(ConfigError, match="features of points"):
         DefRec().prepare(net)
+
+
+def brute_force(a, b, mask_a, mask_b):
+    """Loops over clouds and points."""
+    result = []
+    for cloud in range(len(a)):
+        first, second = a[cloud][mask_a[cloud]], b[cloud][mask_b[cloud]]
+        if len(first) == 0 or len(second) == 0:
+            result.append(a.new_zeros(()))
+            continue
+        forth = torch.stack([torch.stack([(p - q).square().sum() for q in second]).min()
+                             for p in first])  # fmt: skip
+        back = torch.stack([torch.stack([(p - q).square().sum() for p in first]).min()
+                            for q in second])  # fmt: skip
+        result.append(forth.mean() + back.mean())
+    return torch.stack(result)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9), st.integers(0, 10_000))
+def test_values_and_gradients_against_brute_force(b: int, n: int, m: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    a, c = (torch.randn(b, k, 3, generator=generator, dtype=torch.float64) for k in (n, m))
+    mask_a, mask_c = (torch.rand(b, k, generator=generator) < 0.6 for k in (n, m))
+    a.requires_grad_()
+    c.requires_grad_()
+    ours = masked_chamfer(a, c, mask_a, mask_c)
+    theirs = brute_force(a, c, mask_a, mask_c)
+    torch.testing.assert_close(ours, theirs)
+    if theirs.requires_grad:
+        mine = torch.autograd.grad(ours.sum(), (a, c))
+        other = torch.autograd.grad(theirs.sum(), (a, c), allow_unused=True)
+        for x, y in zip(mine, other, strict=True):
+            torch.testing.assert_close(x, torch.zeros_like(x) if y is None else y)
+
+
+def test_known_answer() -> None:
+    a = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [9, 9, 9]]])
+    b = torch.tensor([[[0.0, 2, 0], [0, 0, 0]]])
+    mask = torch.tensor([[True, True, False]])
+    everything = torch.ones(1, 2, dtype=torch.bool)
+    # a to b: 0 and 1, mean 1/2; b to a: 4 and 0, mean 2
+    assert masked_chamfer(a, b, mask, everything).item() == pytest.approx(2.5)
+
+
+def test_voxels_and_centres_known_answers() -> None:
+    third = 1 / 3
+    points = torch.tensor(
+        [[[-1, -1, -1], [0, 0, 0], [0.9, -0.9, 0], [1, 1, 1], [2, -2, 0.5], [-0.34, 0.32, third]]]
+    )
+    # 9 i + 3 j + k; a point outside belongs to the nearest voxel
+    assert voxel_of(points)[0, :5].tolist() == [0, 13, 18 + 0 + 1, 26, 18 + 0 + 2]
+    assert voxel_of(points)[0, 5] // 3 == 1  # x in the first third, y in the second
+    centres = voxel_centre(torch.tensor([0, 13, 19, 26]))
+    expected = torch.tensor([[-2, -2, -2], [0, 0, 0], [2, -2, 0], [2, 2, 2]]) / 3
+    torch.testing.assert_close(centres, expected)
+    every = torch.arange(VOXELS)
+    assert torch.equal(voxel_of(voxel_centre(every)[None])[0], every)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 4), st.integers(1, 80), st.integers(1, 300), st.integers(0, 10_000))
+def test_against_a_loop_over_clouds(b: int, n: int, least: int, seed: int) -> None:
+    points = torch.rand(b, n, 3, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    before = points.clone()
+    found = deform(points, torch.Generator().manual_seed(seed), least)
+    assert torch.equal(points, before)
+    order = torch.randperm(VOXELS, generator=torch.Generator().manual_seed(seed)).tolist()
+    for i in range(b):
+        count = torch.bincount(voxel_of(points)[i], minlength=VOXELS)
+        first = next((v for v in order if count[v] / n >= least / 1024), None)
+        if first is None:
+            assert not found.mask[i].any()
+        else:
+            assert found.voxel[i] == first
+            assert torch.equal(found.mask[i], voxel_of(points)[i] == first)
+        kept = ~found.mask[i]
+        assert torch.equal(found.points[i][kept], points[i][kept])
+
+
+def test_the_blob_s_law() -> None:
+    points = torch.full((8, 500, 3), 0.1)  # all in the middle voxel
+    found = deform(points, torch.Generator().manual_seed(0), 40)
+    assert found.mask.all()
+    assert found.voxel.tolist() == [13] * 8
+    flat = found.points.flatten(0, 1)
+    assert flat.mean(0).abs().max() < 0.003
+    assert flat.var(0).numpy() == pytest.approx(0.001, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("method", "terms"),
+    [
+        (Gast(min_points=2, rot_weight=0.0), ("def_source", "def_target")),
+        (DefRec(min_points=2, dropout=0.0), ("defrec",)),
+        (Mlsp(min_points=2, dropout=0.0, pcm=False), ("position", "normal", "cardinality")),
+    ],
+)
+def test_a_cloud_s_size_changes_nothing_but_what_the_net_sees(method, terms) -> None:
+    """Clouds of 0.2 to 3 m: the loss of the unit ball, if the net divides by their size."""
+    net = tiny_net()
+    features, seen = net.features, []
+    generator = torch.Generator().manual_seed(3)
+    clouds = torch.randn(6, 64, 3, generator=generator)
+    clouds = clouds / cloud_size(clouds)
+    size = torch.tensor([0.2, 0.5, 1.0, 1.3, 2.0, 3.0])[:, None, None]
+    labels = torch.arange(6) % 4
+
+    def loss(points: torch.Tensor, divide: torch.Tensor | float) -> dict[str, torch.Tensor]:
+        net.features = lambda x: (seen.append(x), features(x / divide))[1]
+        batch = {"source": {"points": points, "y_source": labels}, "target": {"points": points}}
+        return method.loss(net, batch, torch.Generator().manual_seed(0))
+
+    method.prepare(net)
+    method.metres = False
+    unit = loss(clouds, 1.0)
+    in_unit_ball, seen = seen[-1], []
+    method.metres = True
+    metres = loss(clouds * size, size)
+    for term in terms:
+        torch.testing.assert_close(metres[term], unit[term])
+    torch.testing.assert_close(seen[-1], in_unit_ball * size)
+    assert cloud_size(torch.zeros(2, 5, 3)).flatten().tolist() == [1.0, 1.0]

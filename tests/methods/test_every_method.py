@@ -15,7 +15,7 @@ from torch import nn
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
-from qs3.methods.base import Method, feature_dims
+from qs3.methods.base import Method
 from qs3.methods.cpcm import Cpcm
 from qs3.methods.dann import Dann
 from qs3.methods.defrec import DefRec
@@ -128,13 +128,6 @@ def test_a_weight_multiplies_its_terms_and_no_others(name: str) -> None:
             torch.testing.assert_close(found[term], factor * value, rtol=1e-4, atol=1e-6)
 
 
-def test_who_sees_the_target() -> None:
-    seen = {name for name, case in CASES.items() if case.make().uses_target}
-    without = {"source_only", "supervised", "pcm", "twin"}
-    students = {name for name in CASES if name.startswith("student")}  # theirs are pseudo-labelled
-    assert seen == set(CASES) - without - students
-
-
 WRONG = [
     *((Dann, "domain_batches", "both"), (PointDan, "node_weight", -1.0)),
     *((DefRec, "defrec_weight", 1.5), (DefRec, "scale", float("inf")), (Gast, "min_points", 0)),
@@ -210,13 +203,3 @@ def test_a_step_lowers_the_loss(name: str) -> None:
             if p.grad is not None:
                 p -= rate * p.grad
     assert _total(net, method, batch) < before
-
-
-def test_asking_for_widths_changes_nothing() -> None:
-    net, _, _ = _made("pcm")
-    net.train()
-    before, state = copy.deepcopy(net.state_dict()), torch.get_rng_state()
-    assert feature_dims(net) == (64, 40)
-    assert net.training
-    assert torch.equal(torch.get_rng_state(), state)
-    assert all(torch.equal(value, before[key]) for key, value in net.state_dict().items())

@@ -11,9 +11,6 @@ import torch
 
 from qs3.errors import ConfigError
 from qs3.methods.base import Method
-from qs3.methods.dann import Dann
-from qs3.methods.gast import Gast
-from qs3.methods.sd import Sd
 from qs3.models.base import PointClassifier
 from qs3.models.features import features
 from qs3.selftraining.pcfea import Pcfea
@@ -63,21 +60,6 @@ def test_each_term_teaches_the_head_or_the_method_is_refused(name: str, file: Pa
     assert all(taught.values()), taught
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        *(Dann(domain_weight=0.0), Sd(consistency_weight=0.0)),
-        Gast(def_weight=0.0, rot_weight=0.0),
-    ],
-    ids=lambda method: type(method).__name__,
-)
-def test_without_the_loss_of_features_it_is_not_refused(method: Method, file: Path) -> None:
-    net = _net(file, 8)
-    method.prepare(net)
-    taught = _taught(net, method, Case(lambda: method, 1))
-    assert taught.pop("ce")
-
-
 def test_pcfea_aligns_what_the_head_s_last_layer_is_given(file: Path) -> None:
     """Of a linear probe that is the frozen vector; styled it can still be."""
     with pytest.raises(ConfigError):
@@ -86,13 +68,3 @@ def test_pcfea_aligns_what_the_head_s_last_layer_is_given(file: Path) -> None:
     method.prepare(net)
     method.styled = True
     assert _taught(net, method, CASES["pcfea"]) == {"ce": True}
-
-
-def test_asking_changes_nothing(file: Path) -> None:
-    """The net stays in its mode, and its statistics as they were."""
-    net = _net(file, 8)
-    before = {name: value.clone() for name, value in net.state_dict().items()}
-    with torch.no_grad(), pytest.raises(ConfigError):
-        Sd().prepare(net)
-    assert net.training
-    assert all(torch.equal(before[name], value) for name, value in net.state_dict().items())

@@ -44,28 +44,6 @@ def test_parts_are_turned_as_their_labels_say(seed: int) -> None:
             assert near_second.sum() == 40 - own
 
 
-def test_autocast_keeps_coordinates() -> None:
-    points = torch.rand(3, 50, 3, generator=torch.Generator().manual_seed(0))
-    full, *_ = turn_parts(points, torch.Generator().manual_seed(1))
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        half, *_ = turn_parts(points, torch.Generator().manual_seed(1))
-    assert half.dtype == torch.float32
-    assert torch.equal(full, half)
-
-
-def test_the_two_labels_are_independent() -> None:
-    """The released code keeps both in one tensor: there they are always equal."""
-    points = torch.rand(64, 8, 3)
-    generator = torch.Generator().manual_seed(0)
-    table = torch.zeros(4, 4)
-    for _ in range(20):
-        _, about_x, about_y, _ = turn_parts(points, generator)
-        table.index_put_((about_x, about_y), torch.ones(64), accumulate=True)
-    expected = 20 * 64 / 16
-    chi2 = float(((table - expected) ** 2 / expected).sum())
-    assert chi2 < 38  # 15 degrees of freedom: 0.1 % are above 37.7
-
-
 def test_a_net_that_knows_nothing_pays_ln_27_and_ln_4() -> None:
     terms = losses(Gast(min_points=2, class_weight=3.0), zero=True)
     assert terms["ce"].item() == pytest.approx(3 * math.log(CLASSES), rel=1e-5)

@@ -2,11 +2,8 @@
 
 Net, data, steps and random draws are the same; only the weight of the loss is 0 in the copy.
 
-What these tests do not say: the shifts of GAST, PointDAN, DANN and DefRec were found by trying 6 to
-12 combinations of shift and weight each, so their gains are optimistic. On clouds no shift was
-found on which DANN's or DefRec's gain in accuracy stood out of its noise; here they are tested by
-what their loss asks for (DANN's accuracy: the moons). DANN's holds for a net without batch
-norm: with it, features of a domain alone told the domain more easily than those of the copy.
+On clouds no shift was found on which DefRec's gain in accuracy stood out of its noise; here it is
+tested by what its loss asks for, and DANN by its paper's moons.
 """
 
 from __future__ import annotations
@@ -18,17 +15,14 @@ import pytest
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from qs3.methods.base import Method
 from qs3.methods.bounds import SourceOnly
 from qs3.methods.dann import Dann
 from qs3.methods.defrec import DefRec, deform, masked_chamfer
-from qs3.methods.gast import Gast
 from qs3.methods.pcm import Pcm
-from qs3.methods.pointdan import PointDan
 from qs3.models.base import Backbone, Features, PointClassifier
-from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, tiny_pointdan, train, unit_ball
+from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, train, unit_ball
 
 POINTS = 64
 
@@ -45,12 +39,6 @@ def clutter(points: Tensor, generator: torch.Generator) -> Tensor:
 def aside(points: Tensor, generator: torch.Generator) -> Tensor:
     """All clouds moved by 1 along x: the target is not where the source is."""
     return points + torch.tensor([1.0, 0.0, 0.0])
-
-
-def tilted(points: Tensor, generator: torch.Generator) -> Tensor:
-    """All clouds turned by 0.6 about x: tables lean."""
-    c, s = math.cos(0.6), math.sin(0.6)
-    return points @ torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]])
 
 
 def noisy(points: Tensor, generator: torch.Generator) -> Tensor:
@@ -99,54 +87,6 @@ def gain(result: Tensor) -> float:
 def test_pcm_withstands_clutter() -> None:
     """A net that has learned to name both parts of a mixture is not led astray by a third."""
     assert gain(compare((Pcm, SourceOnly), clutter)) > 0.05
-
-
-@pytest.mark.slow
-def test_gast_s_questions_carry_over_to_a_target_elsewhere() -> None:
-    """Features that answer them for both domains serve the classifier in both."""
-    off = 1e-9  # 0 would leave out the passes, and what batch norm learns from them
-    on = lambda: Gast(def_weight=0.1, rot_weight=0.1, min_points=48)  # noqa: E731
-    copy = lambda: Gast(def_weight=off, rot_weight=off, min_points=48)  # noqa: E731
-    assert gain(compare((on, copy), aside)) > 0.02
-
-
-@pytest.mark.slow
-def test_pointdan_s_alignment_withstands_strays() -> None:
-    """A tenth of the target's points lie anywhere; aligned nodes and clouds are less led astray."""
-    on = PointDan
-    copy = lambda: PointDan(discrepancy_weight=0.0, node_weight=0.0)  # noqa: E731
-    assert gain(compare((on, copy), strays, tiny_pointdan, steps=200, lr=2e-3)) > 0.01
-
-
-@pytest.mark.slow
-def test_dann_s_features_tell_less_about_the_domain() -> None:
-    """A fresh probe on the features of clouds not trained on names the domain less well.
-
-    This is what its loss asks for. That accuracy follows could not be shown here: for a tilt the
-    gain over six seeds was 0.04 with a standard error of 0.09 (with batch norm in the net).
-    """
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.arange(256) % CLASSES
-    source, new_source = (boxes(labels, POINTS, generator) for _ in range(2))
-    target, new_target = (tilted(boxes(labels, POINTS, generator), generator) for _ in range(2))
-    domain = torch.arange(2).repeat_interleave(256)
-    loss = {}
-    for weight in (1.0, 0.0):
-        net = tiny_net(norm=False)  # no statistics of one domain between train and eval mode
-        method = Dann(domain_weight=weight)
-        train(method, net, (source, labels), target, steps=200, seed=0, batch_size=16)
-        net.eval()
-        with torch.no_grad():
-            x = net.features(torch.cat([new_source, new_target])).global_
-        x = (x - x.mean(0)) / (x.std(0) + 1e-6)
-        probe = nn.Linear(x.shape[1], 2)
-        optimizer = torch.optim.Adam(probe.parameters(), 1e-2)
-        for _ in range(200):
-            loss[weight] = F.cross_entropy(probe(x), domain)
-            optimizer.zero_grad()
-            loss[weight].backward()
-            optimizer.step()
-    assert loss[1.0].item() > 1.5 * loss[0.0].item()
 
 
 @pytest.mark.slow

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from qs3.methods.defrec import deform, nearest
+from qs3.methods.defrec import deform
 from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of, thinnest
-from tests.methods.shapes import CLASSES, boxes, tiny_net, train, unit_ball
+from tests.methods.shapes import tiny_net
 
 
 @settings(max_examples=30, deadline=None)
@@ -39,24 +39,6 @@ def test_normals_are_those_of_eigenvectors() -> None:
             value, vector = torch.linalg.eigh(around.T @ around)
             if value[1] > 2 * value[0]:  # else any direction between will do
                 assert abs(found[i, j].double() @ vector[:, 0]) > 0.999
-
-
-def test_autocast_keeps_surfaces_and_neighbours() -> None:
-    """In bfloat16 every second nearest point was another one."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(2, 300, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.02])
-    told = points + 0.02 * torch.randn(2, 300, 3, generator=generator)
-    mask = torch.ones(2, 300, dtype=torch.bool)
-
-    def found() -> tuple[Tensor, ...]:
-        return normals_of(points), cardinalities(points), *nearest(told, points, mask, mask)
-
-    full = found()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        half = found()
-    for a, b in zip(full, half, strict=True):
-        assert a.dtype == b.dtype
-        assert torch.equal(a, b)
 
 
 def _clouds(b: int = 3, n: int = 64) -> Tensor:
@@ -114,51 +96,6 @@ def test_a_head_that_knows_nothing_pays_2_ln_16() -> None:
     assert set(terms) == {"pcm", "position", "normal", "cardinality"}
     assert terms["cardinality"].item() == pytest.approx(0.05 * 2 * math.log(16), rel=1e-5)
     assert terms["normal"].item() == pytest.approx(0.5 * 2, rel=1e-5)
-
-
-def test_no_voxel_to_mask_is_no_loss_and_no_nan() -> None:
-    method, net = Mlsp(min_points=1025), tiny_net()
-    method.prepare(net)
-    source = {"points": _clouds(), "y_source": torch.arange(3)}
-    batch = {"source": source, "target": {"points": _clouds()}}
-    terms = method.loss(net, batch, torch.Generator().manual_seed(0))
-    assert all(terms[name].item() == 0.0 for name in ("position", "normal", "cardinality"))
-    torch.stack(list(terms.values())).sum().backward()
-    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
-
-
-def thin(points: Tensor) -> Tensor:
-    """Clouds pressed to three tenths of their depth."""
-    return unit_ball(points * torch.tensor([1.0, 0.3, 1.0]))
-
-
-@pytest.mark.slow
-def test_mlsp_learns_the_target_s_surfaces() -> None:
-    """It tells normals and places of unseen thin target clouds, which its copy does not know.
-
-    The copy does the same task on the source's clouds. This is what its loss asks for: normals 0.72
-    (1 by chance) against 1.10, places 0.57 against 0.75; cardinalities are the same. Of three
-    shifts tried, a tilt gave less and noise nothing. That accuracy follows could not be shown here:
-    thin clouds -1 point, moved ones -4 (two seeds each).
-    """
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.arange(64) % CLASSES
-    source = boxes(labels, 256, generator)
-    target, held_out = (thin(boxes(labels, 256, generator)) for _ in range(2))
-    found = []
-    for seen in (target, source):
-        method, net = Mlsp(0.5, 0.5, 0.5, dropout=0.0, pcm=False), tiny_net()
-        train(method, net, (source, labels), seen, steps=150, seed=0, batch_size=8)
-        net.eval()
-        method.eval()
-        with torch.no_grad():
-            batch = {
-                "source": {"points": source, "y_source": labels},
-                "target": {"points": held_out},
-            }
-            found.append(method.loss(net, batch, torch.Generator().manual_seed(5)))
-    assert found[0]["normal"] < 0.8 * found[1]["normal"]
-    assert found[0]["position"] < 0.9 * found[1]["position"]
 
 
 @pytest.mark.parametrize(

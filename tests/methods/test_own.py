@@ -96,19 +96,6 @@ def test_a_file_that_changed_is_not_run(tmp_path: Path) -> None:
         own(str(tmp_path / "no.py"), digest)
 
 
-def test_what_a_module_needs_of_itself(tmp_path: Path) -> None:
-    """A dataclass with postponed annotations asks for its module by name."""
-    text = f"""
-from __future__ import annotations
-from dataclasses import dataclass
-@dataclass(frozen=True)
-class Settings:
-    weight: float = 1.0
-{METHOD.format(name="A")}
-"""
-    assert type(of(tmp_path, text)).__name__ == "A"
-
-
 def test_a_run_is_named_by_the_content_not_by_the_place(tmp_path: Path) -> None:
     def name(file: Path) -> str:
         return config_hash(compose("train", ["method=own", f"method.file={file}"]))

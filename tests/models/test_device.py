@@ -12,10 +12,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3.geometry import neighbours
-from qs3.kernels import edgeconv
 from qs3.kernels.norms import use_domain
-from qs3.models import dgcnn
 from qs3.models.base import PointClassifier
 from tests.device import Watch, as_on_device, as_on_gpu
 from tests.models.test_all_nets import NETS, build, clouds
@@ -44,17 +41,6 @@ def test_kernels_of_a_step(name: str) -> None:
     watch = _step(net, torch.empty(16, 1024, 3, device="meta"))
     assert watch.carried == []
     assert 100 < watch.kernels.total() <= BARS[name]
-
-
-def test_kernels_of_dgcnn_without_triton(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (edgeconv, neighbours, dgcnn):
-        monkeypatch.setattr(module, "takes_triton", lambda x: False)
-    watch = _step(
-        build("dgcnn").float().train().to("meta"), torch.empty(16, 1024, 3, device="meta")
-    )
-    assert watch.carried == []
-    assert BARS["dgcnn"] < watch.kernels.total() <= 250
-    assert not any("qs3" in name for name in watch.kernels)
 
 
 @pytest.mark.slow
@@ -96,17 +82,3 @@ def test_the_way_of_a_device_is_that_of_the_cpu(name: str, training: bool) -> No
     for mine, theirs, by_triton in zip(*found, strict=True):
         torch.testing.assert_close(mine, by_triton, rtol=1e-7, atol=1e-9)
         torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parametrize("negative", [False, True])
-def test_dgcnn_s_answers_without_a_way_back_are_the_cpu_s(negative: bool) -> None:
-    net, points = build("dgcnn").eval(), clouds(2, 40)
-    for norm in (part for part in net.modules() if isinstance(part, torch.nn.BatchNorm1d)):
-        torch.nn.init.normal_(norm.running_mean)
-        torch.nn.init.uniform_(norm.weight, *((-2.0, -0.5) if negative else (-1.0, 2.0)))
-    with torch.no_grad():
-        expected = net(points)
-        with as_on_gpu(), Watch() as watch:
-            found = net(points)
-    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
-    assert watch.counts["qs3.edge_extremes.default"] == 4

@@ -7,11 +7,13 @@ row: the ten logits of the first cloud and the norm of the gradient in all point
 from __future__ import annotations
 
 import pytest
+import torch
 from torch import nn
 
 from qs3.models.base import PointClassifier
 from qs3.models.dgcnn import dgcnn
 from qs3.models.pointnet import pointnet
+from qs3.models.pointnet2 import pointnet2
 from tests.models.by_formula import clouds, figures, fill
 
 PUBLISHED = {  # (net, variant, train mode)
@@ -87,5 +89,42 @@ def test_logits_and_gradients_are_the_authors(name: str, variant: str, training:
         logits = logits.log_softmax(1)  # there a part of the net
     *expected, gradient = PUBLISHED[name, variant, training]
     *found, found_gradient = figures(logits, points)
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert found_gradient == pytest.approx(gradient, rel=1e-5)
+
+
+POINTNET2 = {  # logits of the first cloud, norm of the gradient in the points
+    ("ssg", True): (
+        *(0.0298412, 0.151493, -0.135183, -0.117643, 0.20685),
+        *(0.00776706, -0.162699, 0.0530215, 0.0558266, 0.00299757, 17401.6),
+    ),
+    ("ssg", False): (
+        *(-0.0294398, 0.0591844, -0.0735068, -0.0269349, 0.142819),
+        *(-0.0812794, -0.0963575, 0.140346, -0.0127811, -0.0825467, 0.00162204),
+    ),
+    ("msg", True): (
+        *(0.157728, -0.380308, -0.120848, 0.283043, 0.19502),
+        *(-0.275816, -0.282661, 0.373335, 0.27029, -0.467633, 204814),
+    ),
+    ("msg", False): (
+        *(-0.0667892, 0.0209309, 0.0932563, -0.123753, -0.00852767),
+        *(0.136262, -0.0898078, -0.043748, 0.0882605, -0.0458262, 0.000371285),
+    ),
+}
+
+
+@pytest.mark.parametrize(("variant", "training"), POINTNET2)
+def test_numbers_of_pointnet2(variant: str, training: bool) -> None:
+    """yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/reference/backbones.md."""
+    net = pointnet2(10, variant, dropout=0.0).double()
+    fill([net])
+    if variant == "msg":  # there the features come first
+        for mlp in net.backbone.levels[1].mlps:
+            weight = mlp.linears[0].weight.data
+            weight.copy_(torch.cat([weight[:, -3:], weight[:, :-3]], dim=1))
+    points = clouds(4, 700)
+    points = (points / points.norm(dim=2).amax(1)[:, None, None]).requires_grad_()
+    *expected, gradient = POINTNET2[variant, training]
+    *found, found_gradient = figures(net.train(training)(points), points)
     assert found == pytest.approx(expected, abs=1e-5)
     assert found_gradient == pytest.approx(gradient, rel=1e-5)

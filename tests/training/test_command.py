@@ -52,7 +52,7 @@ def test_every_experiment_composes(name):
 
 
 def test_help_imports_nothing_heavy(tmp_path):
-    """So it is there at once; tests/benchmarks/test_command_speed.py has the time."""
+    """So it is there at once; tests/benchmarks/test_pipeline.py has the time."""
     imported, result = imports_of(tmp_path, "--help")
     assert result.returncode == 0
     assert not imported & HEAVY

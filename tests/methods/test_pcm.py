@@ -61,31 +61,6 @@ def test_parts_are_farthest_point_samples() -> None:
                 assert part in samples
 
 
-def test_all_randomness_is_the_generators() -> None:
-    points, labels = _batch(4, 30)
-    torch.manual_seed(1)
-    state = torch.get_rng_state()
-    first = mix(points, labels, torch.Generator().manual_seed(3))
-    assert torch.equal(torch.get_rng_state(), state)
-    torch.manual_seed(2)
-    second = mix(points, labels, torch.Generator().manual_seed(3))
-    assert all(torch.equal(a, b) for a, b in zip(first[:3], second[:3], strict=True))
-    assert first[3] == second[3]
-    third = mix(points, labels, torch.Generator().manual_seed(4))
-    assert not torch.equal(first[0], third[0])
-
-
-def test_lambda_is_uniform_and_points_are_shuffled() -> None:
-    points, labels = _batch(2, 4)
-    generator = torch.Generator().manual_seed(0)
-    draws = [mix(points, labels, generator) for _ in range(400)]
-    lams = torch.tensor([d[3] for d in draws])
-    assert abs(float(lams.mean()) - 0.5) < 0.05
-    assert abs(float(lams.var()) - 1 / 12) < 0.015
-    owners = torch.stack([d[0][0, :, 0] // 2 for d in draws if d[2][0] == 1])
-    assert (owners.mean(0) - owners.mean()).abs().max() < 0.12  # no place prefers an owner
-
-
 def test_pcm_loss_known_answer() -> None:
     logits = torch.tensor([[math.log(3.0), 0.0]])  # probabilities 3/4, 1/4
     a, b = torch.tensor([0]), torch.tensor([1])
