@@ -14,6 +14,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 from pytest_benchmark.fixture import BenchmarkFixture
+from qs3.datamodules.fps_cache import prepare
 
 import qs3
 from qs3.catalogue import Catalogue
@@ -21,7 +22,6 @@ from qs3.config.compose import composed
 from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
-from qs3.datamodules.fps_cache import prepare
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled
 from qs3.datasets.domain import Domain
