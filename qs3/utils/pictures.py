@@ -6,7 +6,6 @@ Nothing is global (no pyplot): no screen is needed, and no figure stays open.
 from __future__ import annotations
 
 import io
-import struct
 import textwrap
 import warnings
 from collections.abc import Sequence
@@ -207,12 +206,17 @@ def png(image: Image, colours: int = 64) -> bytes:
 
 
 def read_png(
-    source: Path | bytes, where: str = "", *, palette: bool = False
+    source: Path | bytes, where: str = "", *, numbers: bool = False
 ) -> Shaped[np.ndarray, "h w"]:
-    """[h, w] uint8 or uint16 from a grey PNG; with `palette` also the numbers of its colours.
+    """[h, w] uint8 or uint16 from a grey PNG.
+
+    Args:
+        source: the file, or what it holds.
+        where: its name for messages.
+        numbers: also read pictures with a palette, as the numbers of its colours, and of 1 bit.
 
     Raises:
-        DataError: another kind of picture, or damaged; begins with `where`, else the path.
+        DataError: another kind of picture, or damaged.
     """
     from PIL import Image as Pillow
 
@@ -220,69 +224,13 @@ def read_png(
     try:
         data = io.BytesIO(source) if isinstance(source, bytes) else source
         with Pillow.open(data, formats=("PNG",)) as picture:
-            image = np.asarray(picture)
-            mode = picture.mode
+            image, mode = np.asarray(picture), picture.mode
     except (OSError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
         raise DataError(f"{where} cannot be read ({error})") from error
-    if mode not in ("L", "I;16", "I", *["P"] * palette):
-        raise DataError(f"{where}: expected a grey PNG of 8 or 16 bits")
+    if mode not in ("L", "I;16", *("P", "1") * numbers):
+        raise DataError(f"{where}: expected a grey PNG of 8 or 16 bits, not {mode}")
     return image if image.dtype == np.uint8 else image.astype(np.uint16)
 
 
 def _rgb(colour: str) -> tuple[int, ...]:
     return tuple(bytes.fromhex(colour[1:]))
-
-
-MAX_PNG_BYTES = 1 << 26
-_MAX_SIDE_PX = 4096  # of a PNG
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_HEADER = struct.Struct(">8sI4sIIBBBBB")
-_END = b"\0\0\0\0IEND\xaeB`\x82"
-_GREY = 0
-_KINDS = {
-    _GREY: "grey",
-    2: "in colours",
-    3: "in the colours of a palette",
-    4: "grey with transparency",
-    6: "in colours with transparency",
-}
-
-
-def png_bytes(path: Path) -> bytes:
-    """What a PNG file holds.
-
-    Raises:
-        DataError: it cannot be read, or is too large.
-    """
-    try:
-        if path.stat().st_size > MAX_PNG_BYTES:
-            raise DataError(f"{path}: the PNG has more than {MAX_PNG_BYTES} bytes; refused")
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
-
-
-def png_header(data: bytes, where: str) -> tuple[int, int, int, int]:
-    """Width, height, bits and type of colour (0 grey, 2 RGB, 3 palette, 4 and 6 with alpha).
-
-    Raises:
-        DataError: no PNG, a broken one, or one with a side of more than 4096 px or none.
-    """
-    if len(data) > MAX_PNG_BYTES:
-        raise DataError(f"{where}: the PNG has more than {MAX_PNG_BYTES} bytes; refused")
-    if len(data) < _HEADER.size:
-        raise DataError(f"{where}: {len(data)} bytes are not PNG")
-    signature, length, kind, width, height, bits, colour, *_ = _HEADER.unpack_from(data)
-    if signature != _SIGNATURE or kind != b"IHDR" or length != 13:
-        raise DataError(f"{where}: not a PNG")
-    if not (1 <= width <= _MAX_SIDE_PX and 1 <= height <= _MAX_SIDE_PX):
-        raise DataError(f"{where}: a PNG of {width} x {height} px; refused")
-    at, headers = len(_SIGNATURE), 0
-    while at < len(data):  # part by part: whatever length one names, memory would be taken for it
-        headers += data[at + 4 : at + 8] == b"IHDR"
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-    if headers > 1:  # a reader may take the last one's size
-        raise DataError(f"{where}: the PNG has several headers; refused")
-    if at > len(data) or not data.endswith(_END):
-        raise DataError(f"{where}: the PNG is broken off")
-    return width, height, bits, colour

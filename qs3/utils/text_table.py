@@ -62,11 +62,6 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX.get(letter, letter) for letter in text)
 
 
-def three_digits(number: float) -> str:
-    """Three digits that count, and of a large number all before the point: 0.0317, 25.4, 1350."""
-    return f"{number:.3g}" if not abs(number) >= 999.5 else f"{number:.0f}"
-
-
 def printable(text: str) -> str:
     """One line that a terminal and a table can show: what is not printable becomes escapes."""
     return "".join(

@@ -3,11 +3,10 @@
 import csv
 import io
 
-import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from qs3.utils.text_table import aligned, csv_text, latex_row, markdown, three_digits
+from qs3.utils.text_table import aligned, csv_text, latex_row, markdown
 
 ROWS = [("class", "n"), ("a|b", "1000"), ("é", "5 %")]
 
@@ -39,12 +38,3 @@ def test_csv_and_latex():
 def test_any_text_comes_back_from_csv(rows):
     """Also a carriage return, which ends a line for whoever reads it."""
     assert list(csv.reader(io.StringIO(csv_text(rows), newline=""))) == rows
-
-
-@pytest.mark.parametrize(
-    ("number", "text"),
-    [(0, "0"), (0.03171, "0.0317"), (25.43, "25.4"), (999.4, "999"), (1351.2, "1351"),
-     (-2154.6, "-2155"), (999.9, "1000"), (4.7e6, "4700000"), (float("nan"), "nan")],
-)  # fmt: skip
-def test_large_numbers_are_written_out(number, text):
-    assert three_digits(number) == text
