@@ -1,4 +1,4 @@
-"""Pictures: one look for all figures, clouds and values as images, sheets of them, PNG files.
+"""Pictures: one look for all figures, clouds and values as images, and sheets of them.
 
 Nothing is global (no pyplot): no screen is needed, and no figure stays open.
 """
@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 
-from qs3.errors import DataError
 from qs3.utils.files import atomic_path
 
 if TYPE_CHECKING:
@@ -203,33 +202,6 @@ def png(image: Image, colours: int = 64) -> bytes:
     picture = Pillow.fromarray(np.ascontiguousarray(image))
     (picture.quantize(colours) if colours else picture).save(file, format="png", optimize=True)
     return file.getvalue()
-
-
-def read_png(
-    source: Path | bytes, where: str = "", *, numbers: bool = False
-) -> Shaped[np.ndarray, "h w"]:
-    """[h, w] uint8 or uint16 from a grey PNG.
-
-    Args:
-        source: the file, or what it holds.
-        where: its name for messages.
-        numbers: also read pictures with a palette, as the numbers of its colours, and of 1 bit.
-
-    Raises:
-        DataError: another kind of picture, or damaged.
-    """
-    from PIL import Image as Pillow
-
-    where = where or str(source)
-    try:
-        data = io.BytesIO(source) if isinstance(source, bytes) else source
-        with Pillow.open(data, formats=("PNG",)) as picture:
-            image, mode = np.asarray(picture), picture.mode
-    except (OSError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
-        raise DataError(f"{where} cannot be read ({error})") from error
-    if mode not in ("L", "I;16", *("P", "1") * numbers):
-        raise DataError(f"{where}: expected a grey PNG of 8 or 16 bits, not {mode}")
-    return image if image.dtype == np.uint8 else image.astype(np.uint16)
 
 
 def _rgb(colour: str) -> tuple[int, ...]:
