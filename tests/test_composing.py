@@ -1,11 +1,9 @@
 """That tests which share what Hydra reads get what it would compose for them."""
 
 import pytest
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from qs3.datasets import domain
-from tests.composing import by_hydra, compose, compose_domain
+from tests.composing import by_hydra, compose
 from tests.generation.generating import QUICK
 from tests.training.toy import overrides
 
@@ -50,27 +48,3 @@ def test_it_is_what_hydra_composes(case, tmp_path):
     assert list(same) == list(whole)
     assert OmegaConf.is_struct(same) == OmegaConf.is_struct(whole)
     assert before != same or case == "the last word counts"
-
-
-def test_what_is_changed_is_nobody_else_s():
-    changed = compose("train", ["seed=1"])
-    changed.seed = 5
-    del changed.protocol
-    again = compose("train", ["seed=1"])
-    assert (again.seed, "protocol" in again) == (1, True)
-
-
-@pytest.mark.parametrize("word", ["protocol.no_such=1", "seed=1,2", "a.=", "model=no"])
-def test_what_hydra_refuses_is_refused(word):
-    with pytest.raises(HydraException) as said:
-        by_hydra("train", [word])
-    with pytest.raises(HydraException) as ours:
-        compose("train", [word])
-    assert str(ours.value) == str(said.value)
-
-
-def test_a_domain_is_what_the_package_composes(tmp_path):
-    keys = {"paths.data_dir": str(tmp_path), "path": str(tmp_path / "x"), "published.tiers": "[a]"}
-    ours, theirs = (made("nyuv2", keys) for made in (compose_domain, domain.compose_domain))
-    assert ours == theirs
-    assert ours.folder == tmp_path / "x"

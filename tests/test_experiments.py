@@ -26,7 +26,13 @@ def published(tmp_path_factory):
     return SimpleNamespace(folder=folder, write=write)
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+FAST = ("own_meshes", "qs3_s2d")
+
+
+@pytest.mark.parametrize(
+    "experiment",
+    [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in EXPERIMENTS],
+)
 def test_experiment_runs(experiment, published, tmp_path):
     lines = (ROOT / "conf" / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[1].startswith(f"# python train.py experiment={experiment} ")

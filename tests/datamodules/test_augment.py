@@ -109,17 +109,6 @@ def test_one_to_three_regions_are_about_equally_frequent():
     assert float(lost.mean()) == pytest.approx(2 * sum(REGION_SHARE) / 2, abs=0.02)
 
 
-def test_dropping_comes_before_the_rest_and_off_draws_nothing():
-    """With 0 the same numbers as ever are drawn; with more, whole clouds keep their size."""
-    points = torch.rand(4, 50, 3, generator=generator())
-    assert torch.equal(
-        Augment()(points, generator(1)), Augment(drop_regions=0)(points, generator(1))
-    )
-    holed = Augment(drop_regions=2, jitter_sigma=0.0)(points, generator(1))
-    assert holed.shape == points.shape
-    assert len(holed[0].unique(dim=0)) < 50
-
-
 def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
     points = torch.rand(64, 50, 3, generator=generator(2), dtype=torch.float64)
     cut = crop(points, 0.4, generator(1), scale="metres")

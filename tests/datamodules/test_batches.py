@@ -153,6 +153,7 @@ def test_processes_get_different_clouds_of_a_balanced_epoch():
     assert drawn[0] & drawn[1] <= {0}  # the only cloud of its class
 
 
+@pytest.mark.slow
 @given(
     n=st.integers(2, 30),
     other=st.integers(2, 30),

@@ -13,9 +13,9 @@ from torch import nn
 
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.clouds import Clouds, Labelled
-from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
+from qs3.datamodules.domain import DomainData, SpeckleNetData
 from qs3.datasets.domain import compose_domain
-from qs3.errors import ConfigError, MissingDataError
+from qs3.errors import ConfigError
 from qs3.geometry.sampling import unit_ball
 from qs3.store.store import PointSet, open_pointset
 from tests.training.search import Truth, search
@@ -193,15 +193,6 @@ def test_batches_are_the_clouds_of_the_store(data_dir):
     assert torch.equal(clouds_of(data.predict_dataloader()), clouds_of(data.test_dataloader()))
 
 
-def test_batches_in_metres_keep_the_clouds_sizes(data_dir):
-    data = DomainData("kinectsim10", points=64, fps_starts=1, scale="metres", data_dir=data_dir)
-    data.setup()
-    (batch,) = data.test_dataloader()
-    stored = open_pointset(data_dir / "kinectsim10").split("test").points.astype(np.float64)
-    centred = stored - stored.mean(axis=1, keepdims=True)
-    np.testing.assert_allclose(batch["points"].numpy(), centred, atol=1e-5)
-
-
 def test_heights_are_taken_from_the_domain_s_floor(data_dir):
     domain = compose_domain("kinectsim10", {"paths.data_dir": str(data_dir), "floor_m": "-0.5"})
     data = DomainData(domain, points=64, fps_starts=1, scale="above_floor")
@@ -213,16 +204,6 @@ def test_heights_are_taken_from_the_domain_s_floor(data_dir):
     np.testing.assert_allclose(found[..., :2].mean(axis=1), 0, atol=1e-5)
     with pytest.raises(ConfigError, match="floor_m"):
         DomainData("kinectsim10", scale="above_floor", data_dir=data_dir)
-
-
-def test_training_clouds_are_divided_once(data_dir):
-    data = made(data_dir)
-    assert len(data.train.ids) + len(data.validation.ids) == len(data.whole.ids) == 72
-    assert set(data.train.ids) | set(data.validation.ids) == set(data.whole.ids)
-    assert sorted(labels_of(data.train_dataloader())) == sorted(data.train.labels.tolist())
-    assert labels_of(data.val_dataloader()) == data.validation.labels.tolist()
-    other = made(data_dir, val="stratified")
-    assert set(other.validation.ids) != set(data.validation.ids)
 
 
 @pytest.mark.parametrize(
@@ -307,19 +288,3 @@ def test_a_few_clouds_of_each_split_or_class(data_dir, tmp_path):
 
 
 # --- names, configs, errors --------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [
-        (SpeckleNetData, "specklenet10"),
-        (ModelNetData, "modelnet10"),
-        (DepthScanNetData, "depthscannet10"),
-    ],
-)
-def test_each_has_its_domain_and_says_what_is_missing(kind, name, tmp_path):
-    data = kind(data_dir=tmp_path)
-    assert data.domain.name == name
-    assert data.domain.folder == tmp_path / name
-    with pytest.raises(MissingDataError, match=name):
-        data.prepare_data()

@@ -39,6 +39,7 @@ def test_earlier_starts_count(toy):  # noqa: F811
     assert LONG < times.core_seconds < 2 * LONG
 
 
+@pytest.mark.slow
 def test_a_shared_warmup_counts(toy, tmp_path):  # noqa: F811
     times = train(toy("selftraining=none")).times
     assert 0 < times.seconds < LONG

@@ -1,6 +1,8 @@
 """The leaderboard's rules hold for its rows, and a user's own method is one of them."""
 
 import shlex
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 import yaml
@@ -16,11 +18,37 @@ from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
 from qs3.training.command import train
 from tests.composing import compose
-from tests.engine.test_rows import _flat, _place, _within, differing
 from tests.methods.test_own import METHOD, example
 from tests.report.tables.filled import run_cell
 from tests.running import main
 from tests.training.toy import write_toy
+
+
+def _flat(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Dotted keys and their values; what every experiment may call itself is left out."""
+    if isinstance(node, Mapping) and node:
+        found: dict[str, Any] = {}
+        for key, value in node.items():
+            found |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
+        found.pop("experiment_name", None)
+        return found
+    return {prefix: node}
+
+
+def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> set[str]:
+    """Keys that only one config has, or that have different values."""
+    both = one.keys() & other.keys()
+    return (one.keys() ^ other.keys()) | {key for key in both if one[key] != other[key]}
+
+
+def _place(override: str) -> str:
+    """What an override may change: "method=pcm" the group, "model.norm=x" that key alone."""
+    return override.split("=")[0].rpartition("@")[2]
+
+
+def _within(key: str, places: set[str]) -> bool:
+    return any(key == place or key.startswith(f"{place}.") for place in places)
+
 
 SPEC = yaml.safe_load((CONF / "table" / "leaderboard.yaml").read_text("utf-8"))
 LINES = {row["name"]: row["run"].split() for row in SPEC["rows"] if "run" in row}

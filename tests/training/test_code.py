@@ -69,6 +69,7 @@ def test_a_warm_up_is_known_by_its_code():
     assert warmup_sha256(cfg, started) != warmup_sha256(cfg, {**started, "files": {"a": "b"}})
 
 
+@pytest.mark.slow
 def test_a_warm_up_of_a_net_that_was_edited_is_trained_again(own, toy, caplog):
     """It went on from the old net's checkpoint, even where its run had been deleted."""
     caplog.set_level("INFO")

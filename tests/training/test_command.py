@@ -75,6 +75,7 @@ def test_missing_data_are_named_before_anything_heavy_is_imported(tmp_path):
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.slow
 def test_a_start_that_fails_leaves_no_folder_and_touches_no_other(tmp_path):
     words = "experiment=qs3_s2d", "method=supervised"
     assert command(tmp_path, *words).returncode == 1
@@ -98,12 +99,14 @@ def _failed(tmp_path, *words):
     return [path.parent for path in (tmp_path / "logs").glob("*/*/train.log")]
 
 
+@pytest.mark.slow
 def test_ddp_is_refused_in_a_multirun(tmp_path):
     result = command(tmp_path, "experiment=qs3_s2d", "trainer=ddp", "seed=0,1", "-m")
     assert result.returncode == 1
     assert "hydra/launcher=joblib" in result.stderr
 
 
+@pytest.mark.slow
 def test_multirun_then_one_seed(tmp_path, toy_data):  # noqa: F811
     arguments = overrides(tmp_path, f"paths.data_dir={toy_data}", "selftraining=none")
     sweep = command(tmp_path, *arguments, "report.pictures=auto", "seed=0,1", "-m")

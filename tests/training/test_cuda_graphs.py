@@ -19,6 +19,7 @@ from tests.engine.test_cuda_graphs import Played
 POINTNET = ("model._target_=qs3.models.pointnet.pointnet", "+model.variant=basic")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [("method=pcm",), ("method=dann", "selftraining=none")])
 def test_a_run_is_the_same_with_graphs(
     toy: Any, method: tuple[str, ...], monkeypatch: pytest.MonkeyPatch

@@ -15,13 +15,9 @@ import pytest
 import torch
 
 from qs3.config import hashing
-from qs3.config.hydra import build
 from qs3.datamodules.clouds import load_clouds
-from qs3.evaluation.metrics import predict
 from qs3.evaluation.tent import minimise_entropy
 from qs3.runs.checkpoints import load
-from qs3.runs.predictions import write_pseudo_labels
-from qs3.selftraining.selectors import Qbst, TeacherPredictions
 from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.utils.seeding import derive
@@ -102,21 +98,6 @@ def test_same_weights_same_selection(both: Both) -> None:
     assert 10 < records[0][0]["total_selected"] < 75
 
 
-def test_the_table_of_a_later_round_is_what_one_process_makes_of_the_weights(
-    both: Both, tmp_path: Path
-) -> None:
-    root, end = both.one.parents[2], WARMUP + EPOCHS - 1
-    net = build(toy_config(root, *SETTINGS).model)
-    net.load_state_dict(seen_by(both.watched, end)[0]["weights"])
-    target = load_clouds(open_pointset(root / "data/kinectsim10"), "train", 64, scale="unit_ball")
-    probabilities = predict(net, target.points, 64)
-    said = TeacherPredictions.of(probabilities, target.ids)
-    selected = Qbst().select(said, 0.405).selected
-    table = tmp_path / "table.csv"
-    write_pseudo_labels(table, target.ids, said.predicted, said.confidence, selected, CLASSES)
-    assert table.read_bytes() == (both.two / "round_01/pseudo_labels.csv").read_bytes()
-
-
 @pytest.mark.parametrize("round_", [0, 1])
 def test_both_train_on_the_selected_and_on_nothing_else(both: Both, round_: int) -> None:
     """75 clouds in the table, each once; the selected ones shared out."""
@@ -146,24 +127,6 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
             assert torch.equal(one[name], two[name]), (epoch, name)
     student, last = load(both.two / "student.pt"), seen_by(both.watched, WARMUP + 2 * EPOCHS - 1)[0]
     assert all(torch.equal(student[name], last["weights"][name]) for name in student)
-
-
-@pytest.mark.slow
-def test_too_few_pseudo_labels_for_two_processes(
-    toy_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two are enough for one process; of two each would have a batch of one.
-
-    In a job of SLURM with one task (`sbatch`): Lightning by itself would train in one process.
-    """
-    for key, value in {"JOB_ID": 7, "NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0}.items():
-        monkeypatch.setenv(f"SLURM_{key}", str(value))
-    few = ("method=source_only", "selftraining=confident", "selftraining.share=0.02")
-    short = ("protocol.epochs=1", "selftraining.rounds=1", "selftraining.epochs=1")
-    done = command(tmp_path, *overrides(tmp_path, f"paths.data_dir={toy_data}", *few, *short, *TWO))
-    assert done.returncode == 1
-    assert "SelectionError: only 2 pseudo-labels selected in round 0" in done.stderr
-    assert "each of 2 processes needs two" in done.stderr
 
 
 @pytest.mark.slow

@@ -18,12 +18,12 @@ from qs3.runs.metrics import TrainingAccuracy
 from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.utils.locks import owned
-from tests.composing import compose
 from tests.training.conftest import result_of
 from tests.training.toy import write_domain
 from tests.training.watching import interrupt
 
 
+@pytest.mark.slow
 def test_overfit_learns_a_few_clouds_by_heart(toy):
     cfg = toy("debug=overfit", "protocol.epochs=100", "selftraining.rounds=0")
     metrics = train(cfg)
@@ -36,17 +36,6 @@ def test_overfit_learns_a_few_clouds_by_heart(toy):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["dgcnn", "pointnet", "pointnet2"])
-def test_overfit_works_for_real_nets(model, toy_data, tmp_path):
-    """As typed, but for the size of the data."""
-    cfg = compose("train", [
-        "experiment=quickstart", "debug=overfit", f"model={model}", "num_classes=3",
-        f"paths.data_dir={toy_data}", f"paths.log_dir={tmp_path}", "data.points=64",
-        "trainer.threads=1", "callbacks=none", "logger=csv",
-    ])  # fmt: skip
-    assert train(cfg).training.accuracy == 1.0
-
-
 @pytest.mark.parametrize("profiler", ["SimpleProfiler", "PyTorchProfiler"])
 @pytest.mark.filterwarnings("ignore:The PyTorch Profiler default schedule:UserWarning")
 def test_profiler_writes_into_the_run(profiler, toy):
@@ -111,6 +100,7 @@ def begun(toy) -> Path:
     return moved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["", "/last.ckpt"])
 def test_ckpt_path_brings_a_run_from_elsewhere(file, toy, begun, finished, monkeypatch):
     began: list[int] = []
@@ -175,6 +165,7 @@ def change_started(folder, **changes) -> None:
     file.write_text(json.dumps(document))
 
 
+@pytest.mark.slow
 def test_ckpt_path_warns_of_other_versions(toy, begun, caplog):
     change_started(begun, torch="1.0", threads=77)
     cfg = toy(f"ckpt_path={begun}", "paths.warmup_dir=null")
@@ -184,21 +175,6 @@ def test_ckpt_path_warns_of_other_versions(toy, begun, caplog):
     metrics = train(cfg)  # whose own checkpoint it goes on from: still that of both
     assert "begun with torch 1.0, threads 77, continued with" in caplog.text
     assert metrics.versions["torch"] == "1.0"
-
-
-def test_as_many_threads_as_elsewhere(toy, begun, monkeypatch):
-    """By `auto`: sums are ordered by them."""
-    threads = torch.get_num_threads()
-    change_started(begun, threads=threads + 1)
-    taken = []
-    monkeypatch.setattr(torch, "set_num_threads", taken.append)
-    words = (f"ckpt_path={begun}", "paths.warmup_dir=null", "trainer.threads=auto")
-    cfg = toy(*words)
-    other = begun.with_name(hashing.run_folder(cfg).name)  # another setting, another hash
-    begun.rename(other)
-    change_started(other, config_sha256=hashing.config_sha256(cfg))
-    train(toy(f"ckpt_path={other}", *words[1:]))
-    assert taken[-1] == threads + 1
 
 
 @pytest.mark.parametrize(
@@ -220,11 +196,3 @@ def test_a_run_without_a_checkpoint_begins_with_what_there_is(toy, caplog):
     metrics = train(cfg)
     assert "begun with" not in caplog.text
     assert metrics.versions["torch"] == torch.__version__
-
-
-def test_neither_changes_the_name_of_a_run(toy):
-    plain = hashing.run_name(toy())
-    nulls = ("data.clouds_a_class=null", "data.clouds_a_split=null")
-    for word in ("ckpt_path=last", "objective=snd", *nulls):
-        assert hashing.run_name(toy(word)) == plain
-    assert hashing.run_name(toy("data.clouds_a_class=4")) != plain

@@ -17,7 +17,6 @@ from lightning.pytorch import Callback
 from qs3.config import hashing
 from qs3.engine import trainer as engine_trainer
 from qs3.errors import ConfigError, DataError, Qs3Error, SelectionError
-from qs3.inference.model_file import read_result
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training import build as built
 from qs3.training.command import train
@@ -61,6 +60,7 @@ def test_metrics_and_files(finished):
     assert all(float(row["confidence"]) > 0.4 for row in kept)
 
 
+@pytest.mark.slow
 def test_seed_1_alone_equals_seed_1_after_seed_0(toy, toy_data, tmp_path):
     for seed in (0, 1):  # as the basic launcher does: one process
         torch.manual_seed(123)
@@ -111,28 +111,6 @@ def test_other_loading_is_another_result_and_named(toy, finished, more, where, v
     assert getattr(getattr(metrics, where[0]), where[1]) == value
     rows = table(hashing.run_folder(cfg) / "history.csv")
     assert rows != table(finished / "history.csv")[: len(rows)]
-
-
-METRES = ("data.scale=metres", "data.source.unit=metres")
-
-
-def test_metres_are_another_result_and_named(toy, finished):
-    cfg = toy(*METRES, "selftraining=none", "protocol.epochs=1")
-    metrics = train(cfg)
-    assert metrics.loading.scale == "metres"
-    rows = table(hashing.run_folder(cfg) / "history.csv")
-    assert rows != table(finished / "history.csv")[: len(rows)]
-    unit = toy("selftraining=none", "data.source.unit=metres")  # says something, changes nothing
-    assert hashing.config_hash(unit) == hashing.config_hash(toy("selftraining=none"))
-
-
-def test_the_upper_bound_over_the_floor_asks_only_its_own_domain(toy):
-    words = ("method=supervised", "selftraining=none", "protocol.epochs=1")
-    cfg = toy(*words, "data.scale=above_floor", "data.target.floor_m=-1")
-    assert train(cfg).loading.scale == "above_floor"
-    assert read_result(hashing.run_folder(cfg)).floor_m == -1.0
-    other = toy(*words, "data.scale=above_floor", "data.target.floor_m=0")
-    assert hashing.config_hash(other) != hashing.config_hash(cfg)
 
 
 # --- errors ----------------------------------------------------------------------------------

@@ -37,6 +37,7 @@ def frozen(toy_data, tmp_path):
     return config
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [

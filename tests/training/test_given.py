@@ -1,16 +1,13 @@
 """`weights`: a run begins with a trained classifier, which may be its first teacher as it is."""
 
-import csv
 from dataclasses import replace
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from qs3.config import hashing
 from qs3.errors import ConfigError, DataError
-from qs3.inference.model_file import read_result, values_of, write_result
-from qs3.inference.model_folder import write_folder
+from qs3.inference.model_file import read_result, write_result
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
@@ -33,19 +30,6 @@ def test_the_teacher_is_what_was_given(toy, finished):
     last = load(folder / "warmup_last.pt")  # an epoch was trained, and counts for nothing
     assert any(not torch.equal(value, last[name]) for name, value in given.items())
     assert len(metrics.rounds) == 2
-
-
-def test_weights_alone_are_trained_on(toy, finished):
-    words = ("selftraining=none", "protocol.epochs=2", "experiment_name=two")
-    given, fresh = toy(*words, f"weights={finished}"), toy(*words)
-    assert train(given).warmup.selected.epoch >= 0
-    train(fresh)
-
-    def first_loss(cfg):
-        with (hashing.run_folder(cfg) / "history.csv").open() as file:
-            return float(next(csv.DictReader(file))["train/loss"])
-
-    assert first_loss(given) < 0.9 * first_loss(fresh)
 
 
 def test_another_classifier_under_its_name_is_refused(toy, finished, tmp_path):
@@ -82,17 +66,6 @@ def test_a_run_does_not_go_on_with_another_classifier(toy, finished, tmp_path):
                   f"ckpt_path={moved}", "paths.warmup_dir=null"))  # fmt: skip
 
 
-def test_a_finished_run_is_not_that_of_another_kind_of_net(toy, finished, tmp_path):
-    teacher = tmp_path / "teacher.pt"
-    result = read_result(finished)
-    write_result(teacher, result)
-    cfg = toy("selftraining=none", "protocol.epochs=1", f"weights={teacher}")
-    train(cfg)
-    write_result(teacher, replace(result, model={**result.model, "more": 5}))
-    with pytest.raises(ConfigError, match=r"model\.more=5"):
-        train(cfg)
-
-
 def test_a_students_shares_are_of_its_own_source(toy, finished, tmp_path):
     """Beside pseudo-labels it is trained on the run's source, not on its teacher's."""
     result = read_result(finished)
@@ -107,19 +80,6 @@ def test_a_students_shares_are_of_its_own_source(toy, finished, tmp_path):
     assert learnt == pytest.approx(both, abs=0.02)
 
 
-def test_a_prior_weighs_each_net_by_what_it_learnt_from(toy, finished, tmp_path):
-    """The teacher by the shares it came with, the warm-up's last net by the run's own source."""
-    result, warmups = read_result(finished), []
-    for name, learnt in (("even.pt", (1 / 3, 1 / 3, 1 / 3)), ("uneven.pt", (0.98, 0.01, 0.01))):
-        write_result(tmp_path / name, replace(result, learnt=learnt))
-        words = ("selftraining=none", "selection.teacher=given", f"weights={tmp_path / name}")
-        prior = ("evaluation.prior={ball: 1}", "evaluation.prior_power=1.0")
-        warmups.append(train(toy(*words, *prior, "protocol.epochs=1")).warmup)
-    even, uneven = warmups
-    assert even.selected.scores != uneven.selected.scores
-    assert even.last.scores == uneven.last.scores
-
-
 def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
     words = (*ONLY_ROUNDS, f"weights={finished}")
     whole = toy(*words)
@@ -129,15 +89,6 @@ def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
         interrupt(again, epoch=epoch)
     train(again)
     assert result_of(hashing.run_folder(again)) == result_of(hashing.run_folder(whole))
-
-
-def test_a_folder_of_half_precision_is_another_teacher(toy, finished, tmp_path):
-    result = read_result(finished)
-    half = {name: value.half() for name, value in result.weights.items()}
-    write_folder(tmp_path / "half", values_of(replace(result, weights=half)), "card")
-    metrics = train(toy(*ONLY_ROUNDS, f"weights={tmp_path / 'half'}", "selftraining.rounds=1"))
-    assert metrics.selection.teacher == "given, half"
-    assert metrics.warmup.selected.scores.n == read_metrics(finished).final.n
 
 
 @pytest.mark.parametrize(
@@ -156,10 +107,3 @@ def test_what_does_not_fit_is_told(toy, finished, tmp_path, change, words, error
     write_result(tmp_path / "result.pt", replace(result, **change))
     with pytest.raises(error, match=message):
         train(toy(*words, f"weights={tmp_path / 'result.pt'}"))
-
-
-def test_without_it_the_hash_is_as_before_there_was_such_a_key(toy):
-    cfg = toy()
-    before = OmegaConf.to_container(cfg, resolve=False)
-    assert before.pop("weights", "") is None
-    assert hashing.config_sha256(OmegaConf.create(before)) == hashing.config_sha256(cfg)

@@ -16,14 +16,12 @@ from qs3.datamodules.clouds import Clouds, load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import RunMetrics
-from qs3.runs.predictions import pseudo_labels_path, read_pseudo_labels
+from qs3.runs.predictions import read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
 from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.utils.seeding import derive
-from tests.training.conftest import result_of
 from tests.training.toy import CLASSES, toy_config
-from tests.training.watching import interrupt
 
 # 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1
 STARTS, ENDS = (0, 4, 7), (3, 6, 9)
@@ -78,19 +76,6 @@ def persistent(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept
     return kept_run(tmp_path_factory.mktemp("persistent"), toy_data, *PERSISTENT)
 
 
-@pytest.mark.parametrize("run", ["scratch", "continued"])
-def test_a_round_says_how_many_labels_it_kept_from_the_round_before(run, request):
-    found = request.getfixturevalue(run)
-    assert found.metrics.rounds[0].agreement is None
-    labels = [
-        [row.label for row in read_pseudo_labels(pseudo_labels_path(found.folder, round_))]
-        for round_ in range(2)
-    ]
-    kept = [a == b for a, b in zip(*labels, strict=True)]
-    assert found.metrics.rounds[1].agreement == pytest.approx(sum(kept) / len(kept))
-    assert not all(kept)
-
-
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     assert a.keys() == b.keys()
     return all(torch.equal(a[name], b[name]) for name in a)
@@ -126,17 +111,6 @@ def test_continued_students_begin_with_their_teacher(continued: Kept) -> None:
     assert not same(selected, continued.net(3))
 
 
-def test_a_share_of_the_target_exceeds_each_round_s_threshold(continued: Kept) -> None:
-    """`selftraining.share`: theta by the predictions of the round, whatever they are."""
-    for record in continued.metrics.rounds:
-        table = read_pseudo_labels(pseudo_labels_path(continued.folder, record.round))
-        said = torch.tensor([row.confidence for row in table], dtype=torch.float64)
-        assert record.theta == pytest.approx(said.quantile(0.4).item())
-        assert record.total_selected == (said > record.theta).sum() == round(0.6 * len(said))
-    first, second = continued.metrics.rounds
-    assert first.theta != second.theta
-
-
 @pytest.mark.slow
 def test_target_norms_go_on_from_the_source_s(tmp_path: Path, toy_data: Path) -> None:
     """For a teacher that never saw the target, by its batches: the source's statistics count."""
@@ -163,13 +137,6 @@ def test_a_persistent_student_is_new_in_round_0_and_kept_afterwards(persistent: 
     assert persistent.before(7)["moments"] > 0
     steps = {e: persistent.checkpoint(e)["optimizer_states"][0]["state"][0]["step"] for e in (6, 7)}
     assert steps[7] > steps[6] > 0
-
-
-def test_a_persistent_run_that_was_interrupted_ends_the_same(persistent: Kept, toy) -> None:
-    cut = toy(*PERSISTENT)
-    interrupt(cut, epoch=7)
-    train(cut)
-    assert result_of(hashing.run_folder(cut)) == result_of(persistent.folder)
 
 
 @pytest.mark.parametrize("name", ["scratch", "continued"])

@@ -39,14 +39,14 @@ def slow(*values: str):
     [
         ("on_train_start", 1),
         ("on_train_batch_end", 2),  # before the first checkpoint
-        ("on_train_batch_end", 7),  # mid epoch 1
-        ("on_train_batch_end", 17),  # first epoch of round 0, weights just reset
-        ("on_validation_batch_end", 3),
+        slow("on_train_batch_end", 7),  # mid epoch 1
+        slow("on_train_batch_end", 17),  # first epoch of round 0, weights just reset
+        slow("on_validation_batch_end", 3),
         ("on_train_epoch_start", 5),  # between selection and the first batch of round 0
-        ("on_train_epoch_end", 4),  # selected, but not yet in a checkpoint
+        slow("on_train_epoch_end", 4),  # selected, but not yet in a checkpoint
         ("on_train_epoch_end", 7),
-        ("on_train_epoch_end", 10),  # last epoch
-        ("on_train_end", 1),
+        slow("on_train_epoch_end", 10),  # last epoch
+        slow("on_train_end", 1),
     ],
 )
 def test_interrupted_in_a_hook(toy, finished, hook, count):
@@ -59,20 +59,6 @@ def test_interrupted_in_a_hook(toy, finished, hook, count):
     assert ours["state_dict"].keys() == theirs["state_dict"].keys()
     for name, value in theirs["state_dict"].items():
         assert torch.equal(ours["state_dict"][name], value), name
-
-
-def test_interrupted_again_and_again(toy, finished):
-    cfg = toy()
-    for hook, count in [
-        ("on_train_batch_end", 6),
-        ("on_train_epoch_end", 2),
-        ("on_train_batch_end", 5),
-        ("on_train_epoch_start", 3),
-        ("on_train_epoch_end", 3),
-    ]:
-        interrupt(cfg, hook, count)
-    train(cfg)
-    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
 
 
 def test_it_goes_on_with_the_threads_that_it_was_begun_with(toy, monkeypatch):
@@ -90,7 +76,7 @@ def test_it_goes_on_with_the_threads_that_it_was_begun_with(toy, monkeypatch):
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("call", [1, 4, 5, 6, 10])
+@pytest.mark.parametrize("call", [1, slow(4), slow(5), slow(6), slow(10)])
 def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, call):
     cfg = toy()
     calls = 0
@@ -116,9 +102,9 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
     ("module", "name", "call"),
     [
         (qs3.selftraining.callback, "predict", 1),
-        (qs3.selftraining.callback, "predict", 2),
+        slow(qs3.selftraining.callback, "predict", 2),
         (qs3.selftraining.callback, "write_pseudo_labels", 1),
-        (qs3.selftraining.callback, "check_selection", 2),
+        slow(qs3.selftraining.callback, "check_selection", 2),
         (qs3.training.command, "write_metrics", 1),
     ],
 )
@@ -142,6 +128,7 @@ def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, cal
     assert result_of(hashing.run_folder(cfg)) == result_of(finished)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [

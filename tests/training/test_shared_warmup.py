@@ -309,26 +309,7 @@ def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
     assert all(torch.equal(weights[name], again[name]) for name in weights)
 
 
-def test_another_warmup_is_not_taken(toy, tmp_path, caplog):
-    short = ("selftraining=none", "protocol.epochs=3")
-    train(toy(*short))
-    changes = ("protocol.epochs=2", "seed=1", "method=source_only", "selection.teacher=last")
-    for number, change in enumerate(changes, 2):
-        train(toy(*short, change))
-        assert not taken(caplog), change
-        assert len(shared_folders(tmp_path)) == number
-
-
-def test_a_damaged_mark_is_as_good_as_none(toy, tmp_path, caplog):
-    train(toy("selftraining=none"))
-    (folder,) = shared_folders(tmp_path)
-    (folder / "started.json").write_text("{")
-    train(toy("selftraining=none", "experiment_name=other"))
-    assert not taken(caplog)
-    train(toy("selftraining=none", "experiment_name=third"))  # it was repaired
-    assert taken(caplog)
-
-
+@pytest.mark.slow
 def test_a_flipped_bit_is_trained_again(toy, tmp_path, caplog):
     train(toy("selftraining=none"))
     (folder,) = shared_folders(tmp_path)
@@ -351,12 +332,6 @@ def test_a_flipped_bit_is_trained_again(toy, tmp_path, caplog):
     assert train(other).final == read_metrics(hashing.run_folder(toy("selftraining=none"))).final
     assert not taken(caplog)
     assert take("repaired")
-
-
-def test_force_trains_anew(toy, caplog):
-    train(toy("selftraining=none"))
-    train(toy("selftraining=none", "experiment_name=other", "force=true"))
-    assert not taken(caplog)
 
 
 def test_what_cannot_be_written_is_a_warning(toy, tmp_path, caplog):

@@ -21,24 +21,18 @@ from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import STUDENT_RULES
-from qs3.evaluation.validators import LABEL_FREE, hold_out
+from qs3.evaluation.validators import LABEL_FREE
 from qs3.runs.checkpoints import copy_weights, load
 from qs3.runs.metrics import RunMetrics, read_metrics
-from qs3.runs.predictions import OF_FILES, read_pseudo_labels
+from qs3.runs.predictions import read_pseudo_labels
 from qs3.selftraining.student_selection import StudentSelection
-from qs3.store.store import ManifestRow, open_pointset, write_pointset
+from qs3.store.store import open_pointset
 from qs3.training.command import headline, train
-from qs3.utils.seeding import derive
-from tests.running import command
 from tests.training.conftest import result_of
-from tests.training.toy import CLASSES, overrides, toy_config
+from tests.training.toy import CLASSES, toy_config
 from tests.training.watching import Stop, interrupt
 
 RULES = STUDENT_RULES[1:]
-FAST = ("pseudo_val", "snd")  # `make test-all` runs the others, too
-SOME_RULES = tuple(
-    pytest.param(rule, marks=[] if rule in FAST else pytest.mark.slow) for rule in RULES
-)
 LAST_ROUND = range(7, 10)  # epochs; 0 to 3 are the warm-up, 4 to 6 round 0
 WEIGHTS = ("warmup_selected.pt", "warmup_last.pt", "student.pt")
 
@@ -89,18 +83,6 @@ def same_weights(one: Path, other: Path) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def copy_with_other_labels(data: Path, folder: Path) -> None:
-    """The same target clouds and ids under other labels, in both splits."""
-    old = open_pointset(data / "kinectsim10")
-    labels = (old.labels + 1) % 3
-    rows = [
-        ManifestRow(id=i, cls=CLASSES[y], split=s)
-        for i, y, s in zip(old.ids, labels, old.splits, strict=True)
-    ]
-    arrays = {"points": old.points}
-    write_pointset(folder, name="kinectsim10", classes=CLASSES, arrays=arrays, rows=rows, meta={})
-
-
 def table_of(cfg: Any, weights: Path, data: Path, rows: Any = slice(None)) -> np.ndarray:
     """What weights say of the target's training clouds, or of some of them."""
     net = build(cfg.model)
@@ -122,10 +104,6 @@ def test_last_is_the_default_and_leaves_nothing_behind(finished):
         f"; teacher selected by source_val, epoch {metrics.warmup.selected.epoch + 1}; "
         "student by last"
     )
-
-
-def test_each_rule_is_a_run_of_its_own(toy):
-    assert len({hashing.config_sha256(toy(f"selection.student={r}")) for r in STUDENT_RULES}) == 5
 
 
 @pytest.mark.parametrize("rule", LABEL_FREE)
@@ -234,38 +212,6 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
     assert len(held) == pytest.approx(len(selected) / 5, abs=1.5)
 
 
-def test_held_out_accuracy(by_rule, toy, toy_data):
-    """Computed again for the chosen epoch from its weights, the seed and the round's table."""
-    folder = by_rule("pseudo_val")
-    student = metrics_of(folder).student
-    rows = read_pseudo_labels(folder / "round_01" / "pseudo_labels.csv")
-    selected = [i for i, row in enumerate(rows) if row.selected]
-    labels = np.array([CLASSES.index(rows[i].label) for i in selected])
-    held = hold_out(labels, [rows[i].id for i in selected], derive(0, "pseudo_val", 1))
-    assert held.sum() == student.held_out > 0
-    rows = np.array(selected)[held]
-    table = table_of(toy(), folder / "student_selected.pt", toy_data, rows)
-    assert student.score == (table.argmax(axis=1) == labels[held]).mean()
-
-
-def test_all_before_the_last_round_is_as_without_holding_out(by_rule, finished):
-    ours, theirs = result_of(by_rule("pseudo_val")), result_of(finished)
-    for name in theirs:
-        if name.startswith("round_"):
-            assert ours[name] == theirs[name], name
-    rows, expected = (r["history.csv"].splitlines() for r in (ours, theirs))
-    assert rows[: 1 + LAST_ROUND[0]] == expected[: 1 + LAST_ROUND[0]]
-    assert rows[1 + LAST_ROUND[0] :] != expected[1 + LAST_ROUND[0] :]
-    assert not same_weights(by_rule("pseudo_val") / "student.pt", finished / "student.pt")
-
-
-def test_soft_pseudo_labels_are_held_out_by_their_most_probable_class(toy):
-    soft = ("selftraining=crst_lrent", "selftraining.theta=0", "selftraining.epsilon=0")
-    metrics = train(toy(*soft, "selection.student=pseudo_val"))
-    assert metrics.student.held_out > 0
-    assert 0 <= metrics.student.score <= 1
-
-
 def test_a_label_of_no_weight_is_not_held_out(tmp_path):
     """It names no class: all of it being 0, its first place is not its most probable one."""
     callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val")
@@ -301,42 +247,7 @@ def test_each_process_has_two_to_train_on(tmp_path):
         callback._hold_out(data, processes=4)
 
 
-def test_too_few_to_hold_out(toy, monkeypatch):
-    def two_of_each(net, points, batch_size, device="cpu"):
-        table = np.full((len(points), 3), 1 / 3)
-        for i in range(6):
-            table[i] = np.where(np.arange(3) == i % 3, 0.96 + i / 1000, 0.02 - i / 2000)
-        return table
-
-    monkeypatch.setattr("qs3.selftraining.callback.predict", two_of_each)
-    with pytest.raises(SelectionError, match="round 2"):
-        train(toy("selection.student=pseudo_val", "selftraining.rounds=3", "selftraining.epochs=1"))
-
-
 # --- the target's labels ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rule", ["last", *SOME_RULES])
-def test_other_target_labels_change_the_figures_and_nothing_else(
-    by_rule, toy, toy_data, tmp_path, rule
-):
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "specklenet10").symlink_to(toy_data / "specklenet10")
-    copy_with_other_labels(toy_data, other / "kinectsim10")
-    cfg = toy(f"paths.data_dir={other}", f"selection.student={rule}")
-    metrics = train(cfg)
-    folder, theirs = hashing.run_folder(cfg), metrics_of(by_rule(rule))
-    chosen = () if rule == "last" else ("student_selected.pt",)
-    for name in (*WEIGHTS, *chosen):
-        assert same_weights(folder / name, by_rule(rule) / name)
-    assert metrics.selection == theirs.selection
-    assert (metrics.quality, metrics.validators) == (theirs.quality, theirs.validators)
-    assert not (folder / OF_FILES).exists()  # of targets without labels alone
-    ours, expected = result_of(folder), result_of(by_rule(rule))
-    assert ours.pop("metrics") != expected.pop("metrics")
-    assert ours == expected  # history and all pseudo-labels
-    assert metrics.final.accuracy < 0.5
 
 
 # --- interruptions -----------------------------------------------------------------------------
@@ -377,21 +288,3 @@ def test_interrupted_while_holding_out(by_rule, toy, monkeypatch):
             train(cfg)
     train(cfg)
     assert result_of(hashing.run_folder(cfg)) == result_of(by_rule("pseudo_val"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rule", RULES)
-def test_two_processes_choose_one_student(toy_data, tmp_path, rule):
-    """The score is that of the first process, whose weights are saved."""
-    more = [f"paths.data_dir={toy_data}", f"selection.student={rule}"]
-    more += ["trainer.devices=2", "trainer.strategy=ddp"]
-    done = command(tmp_path, *overrides(tmp_path, *more))
-    assert done.returncode == 0, done.stderr
-    cfg = toy_config(tmp_path, *more)
-    folder = hashing.run_folder(cfg)
-    student = metrics_of(folder).student
-    if rule in LABEL_FREE:
-        table = table_of(cfg, folder / "student_selected.pt", toy_data)
-        assert student.score == pytest.approx(LABEL_FREE[rule].score(table), abs=1e-6)
-    scores = student.scores.values()
-    assert student.score == (min if rule == "entropy" else max)(scores)

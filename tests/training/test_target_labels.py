@@ -143,6 +143,7 @@ def test_no_target_label_within_reach(toy, tmp_path, watch, settings, class_in_i
     assert watch.keys == {"points", "y_source"} | more
 
 
+@pytest.mark.slow
 def test_the_upper_bound_does_hold_them(toy, tmp_path, watch):
     """The same search finds what `method=supervised` asks for: the training labels alone."""
     write_domain(tmp_path / "data", "specklenet10", noise=0.05)

@@ -9,14 +9,9 @@ import numpy as np
 import pytest
 
 from qs3.config import hashing
-from qs3.report.tables.formats import markdown
-from qs3.report.tables.results import summarise
-from qs3.report.tables.table import build_table
-from qs3.runs.metrics import Selection, read_metrics
+from qs3.runs.metrics import read_metrics
 from qs3.store.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.training.command import headline, train
-from tests.report.tables.filled import run_cell
-from tests.running import main
 from tests.training.toy import CLASSES
 
 
@@ -80,27 +75,7 @@ def test_own_scans_without_labels(toy, unlabelled, finished, more):
     assert train(cfg) == metrics == read_metrics(hashing.run_folder(cfg))
 
 
-def test_table_of_such_runs(tmp_path):
-    table = build_table("quickstart", tmp_path)
-    for cell in table.cells:
-        if cell is table.cells[0] or cell.overrides != table.cells[0].overrides:
-            selection = Selection(teacher="last", student="last", validation="stratified")
-            run_cell(tmp_path, cell, accuracy=None, selection=selection)
-            break
-    text = markdown(build_table("quickstart", tmp_path))
-    assert "no target labels" in text
-
-
-def test_reports_of_such_runs(toy, unlabelled, tmp_path):
-    cfg = toy("selftraining=none", "protocol.epochs=1")
-    train(cfg)
-    text = summarise([hashing.run_folder(cfg)])
-    assert "no target labels, so no accuracy" in text
-    assert "simulated" in text
-    words = ["table=quickstart", f"log_dir={tmp_path / 'logs'}", f"out={tmp_path / 'out'}"]
-    assert main(["report", *words]) == 0
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("labelled", [True, False])
 def test_without_a_test_split_predictions_of_the_training_clouds_are_counted(
     toy, toy_data, tmp_path, request, caplog, labelled
