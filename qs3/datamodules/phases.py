@@ -108,7 +108,7 @@ class SelfTrainingConfig:
         pcm: whether the student's clouds are mixed (see `qs3.methods.pcm`).
         weight_step: by how much the weight of both losses falls each epoch of the rounds, from 1
             (GAST's code: 0.005; both fall alike, so only its relation to the weight decay matters).
-        mrkld: weight of CRST's regulariser (see `qs3.selftraining.student_loss`); 0 is none.
+        mrkld: weight of CRST's regulariser (see `qs3.selftraining.student_selection`); 0 is none.
         missing_class: what to do if a class has no pseudo-label: "warn" or "error".
         rehearsal: train on all target samples, whatever the selector keeps (`debug=fast`).
 

@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, ReduceLROnPlateau
 
 from qs3.datamodules.batches import generator_of
 from qs3.datamodules.phases import Phases
 from qs3.engine.cuda_graphs import Graphs
-from qs3.engine.schedules import Plateau, cosine
 from qs3.kernels.norms import use_trained
 from qs3.methods.base import Method, total_loss
 from qs3.models.base import Backbone, PointClassifier
@@ -39,7 +40,7 @@ class Classifier(LightningModule):
         student: loss of the rounds.
         phases: which epoch belongs to which phase; each phase has its own schedule.
         seed: of the run.
-        schedule: of the learning rate, see `qs3.engine.schedules`.
+        schedule: of the learning rate, see `qs3.engine.classifier`.
         smoothing: of class labels, see `qs3.methods.base.class_loss`.
         metres: whether clouds keep their size.
         regulariser_weight: of what a backbone wants in the loss (`Features.regulariser`).
@@ -232,3 +233,51 @@ class Classifier(LightningModule):
         self._hits.clear()
         accuracy = float(self.trainer.strategy.broadcast(accuracy))
         self.log(f"{self.method.labels}_val/acc", accuracy, **_PER_EPOCH)
+
+
+PLATEAU_FACTOR, PLATEAU_PATIENCE, PLATEAU_MIN_LR = 0.5, 10, 1e-5
+
+
+class Plateau:
+    """Steps by hand at the end of an epoch: Lightning would step after the epoch's checkpoint.
+
+    Args:
+        optimizer: with the rates to begin with.
+    """
+
+    def __init__(self, optimizer: Optimizer) -> None:
+        self.optimizer = optimizer
+        self._rates = [group["lr"] for group in optimizer.param_groups]
+        self._restart()
+
+    def _restart(self) -> None:
+        self._scheduler = ReduceLROnPlateau(
+            self.optimizer,
+            factor=PLATEAU_FACTOR,
+            patience=PLATEAU_PATIENCE,
+            min_lr=PLATEAU_MIN_LR,
+        )
+
+    def start_phase(self) -> None:
+        """The first rates again, and no memory of losses."""
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate
+        self._restart()
+
+    def step(self, loss: float) -> None:
+        """At the end of an epoch with this mean training loss."""
+        self._scheduler.step(loss)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a resume needs besides the optimiser's state, which holds the rates."""
+        known = self._scheduler.state_dict()
+        return {key: known[key] for key in ("best", "num_bad_epochs", "cooldown_counter")}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore `state_dict`."""
+        self._scheduler.load_state_dict(state)
+
+
+def cosine(optimizer: Optimizer, phases: Phases) -> LambdaLR:
+    """The half cosine of each phase, stepped by Lightning."""
+    return LambdaLR(optimizer, phases.cosine)

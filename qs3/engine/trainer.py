@@ -37,7 +37,7 @@ def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
             use_distributed_sampler=False,  # `Batches` shares the clouds out itself
             num_sanity_val_steps=0,
             log_every_n_steps=1,
-            enable_progress_bar=False,  # `qs3.engine.progress` shows all epochs in one bar
+            enable_progress_bar=False,  # `qs3.engine.loggers` shows all epochs in one bar
             enable_model_summary=False,
         )
     except (MisconfigurationException, TypeError, ValueError) as error:

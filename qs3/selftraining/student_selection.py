@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor, nn
 
@@ -30,6 +29,9 @@ from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
+from qs3.kernels.norms import use_domain
+from qs3.methods.base import Method, class_loss
+from qs3.methods.pcm import mix, pcm_loss
 from qs3.runs.checkpoints import copy_weights, save
 from qs3.utils.seeding import derive
 
@@ -38,44 +40,9 @@ log = logging.getLogger(__name__)
 STUDENT_SELECTED = "student_selected.pt"
 
 
-@dataclass(frozen=True)
-class Choice:
-    """An epoch of the last round, and why it is this one.
-
-    Attributes:
-        rule: by which it was chosen.
-        epoch: of the run, counted from 0.
-        score: its score, by the rule.
-        scores: of all epochs of the last round.
-        file: its weights.
-        held_out: number of pseudo-labelled clouds that were not trained on.
-    """
-
-    rule: str
-    epoch: int
-    score: float
-    scores: Mapping[int, float]
-    file: Path
-    held_out: int = 0
-
-    @property
-    def in_words(self) -> str:
-        """Such as "snd, epoch 57, score 4.2"; what `metrics.json` has as `selection.student`."""
-        return f"{self.rule}, epoch {self.epoch}, score {self.score:.6g}"
-
-    def record(self) -> dict[str, Any]:
-        """What `metrics.json` has under `student`."""
-        return {
-            "rule": self.rule,
-            "epoch": self.epoch,
-            "score": _finite(self.score),
-            "scores": {str(epoch): _finite(score) for epoch, score in self.scores.items()},
-            "held_out": self.held_out,
-        }
-
-
-def _finite(score: float) -> float | None:
-    return score if math.isfinite(score) else None  # of a net that has diverged
+def _finite(score: float | None) -> float | None:
+    # Not finite: of a net that has diverged.
+    return score if score is not None and math.isfinite(score) else None
 
 
 class StudentSelection(Callback):
@@ -190,10 +157,82 @@ class StudentSelection(Callback):
         self.epoch, self.score = state_dict["epoch"], state_dict["score"]
         self.held_out, self._weights = state_dict["held_out"], state_dict["weights"]
 
-    def choice(self) -> Choice:
-        """What was chosen, when training is over; not for `last`."""
-        assert self.epoch is not None
-        assert self.score is not None
-        held = 0 if self.held_out is None else len(self.held_out[0])
-        file = self.folder / STUDENT_SELECTED
-        return Choice(self.rule, self.epoch, self.score, dict(self.scores), file, held)
+    @property
+    def file(self) -> Path:
+        """Weights of the chosen epoch."""
+        return self.folder / STUDENT_SELECTED
+
+    @property
+    def in_words(self) -> str:
+        """Such as "snd, epoch 57, score 4.2"; what `metrics.json` has as `selection.student`."""
+        return f"{self.rule}, epoch {self.epoch}, score {self.score:.6g}"
+
+    def record(self) -> dict[str, Any]:
+        """What `metrics.json` has under `student`."""
+        return {
+            "rule": self.rule,
+            "epoch": self.epoch,
+            "score": _finite(self.score),
+            "scores": {str(epoch): _finite(score) for epoch, score in self.scores.items()},
+            "held_out": 0 if self.held_out is None else len(self.held_out[0]),
+        }
+
+
+class Student(Method):
+    """L = w [CE(net(x_t), ŷ_t) + m R(net(x_t))], plus w CE on labelled source clouds if any.
+
+    ŷ_t are classes, or probabilities (CRST's LRENT).
+
+    Args:
+        pcm: mix the clouds first (QBST does not).
+        weight_step: w = 1 - weight_step * (epochs of the rounds so far).
+        mrkld: m, weight of R = -1/K sum_k log p_k, the divergence of the prediction from the
+            uniform one up to a constant: CRST's MRKLD (Zou et al., "Confidence Regularized
+            Self-Training", ICCV 2019, table 1), 0.1 in its code. At least ln K.
+        first_epoch: the first epoch of the rounds.
+    """
+
+    def __init__(
+        self,
+        pcm: bool = False,
+        weight_step: float = 0.0,
+        mrkld: float = 0.0,
+        first_epoch: int = 0,
+    ) -> None:
+        super().__init__()
+        self.pcm, self.weight_step, self.mrkld = pcm, weight_step, mrkld
+        self.first_epoch = first_epoch
+
+    def loss(
+        self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Terms "pseudo" and, if the batch has source clouds, "source"; each >= 0."""
+        target = batch["target"]
+        with use_domain(net, "target"):
+            loss, logits = self._fit(net, target["points"], target["y_pseudo"], generator)
+        if self.mrkld:
+            loss = loss + self.mrkld * uniform_divergence(logits)
+        terms = {"pseudo": loss}
+        if "source" in batch:
+            source = batch["source"]
+            terms["source"], _ = self._fit(net, source["points"], source["y_source"], generator)
+        if self.weight_step:
+            w = 1 - self.weight_step * (batch["epoch"] - self.first_epoch)
+            terms = {name: w * term for name, term in terms.items()}
+        return terms
+
+    def _fit(
+        self, net: nn.Module, points: Tensor, labels: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Cross-entropy, mixed or not, and logits."""
+        if not self.pcm:
+            logits = net(points)
+            return class_loss(logits, labels, self.smoothing), logits
+        mixed, labels_a, labels_b, lam = mix(points, labels, generator)
+        logits = net(mixed)
+        return pcm_loss(logits, labels_a, labels_b, lam, self.smoothing), logits
+
+
+def uniform_divergence(logits: Float[Tensor, "b c"]) -> Float[Tensor, ""]:
+    """-1/K sum_k log p_k, mean over clouds: ln K where p is uniform, more elsewhere."""
+    return -logits.log_softmax(dim=1).mean()

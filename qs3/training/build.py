@@ -17,8 +17,7 @@ from qs3.engine.trainer import build_each, let_weights_rest, make_trainer
 from qs3.kernels.norms import DomainNorm, check_has_norms
 from qs3.methods.base import Method, feature_dims
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
-from qs3.selftraining.student_loss import Student
-from qs3.selftraining.student_selection import StudentSelection
+from qs3.selftraining.student_selection import Student, StudentSelection
 from qs3.training.given import Given
 from qs3.training.load import Loaded
 from qs3.training.provenance import changed

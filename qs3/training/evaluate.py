@@ -27,7 +27,7 @@ from qs3.runs.checkpoints import copy_weights, load, weights_sha256
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
-from qs3.selftraining.student_selection import Choice
+from qs3.selftraining.student_selection import StudentSelection
 from qs3.training import class_shares
 from qs3.training.build import Built
 from qs3.training.load import Loaded
@@ -54,7 +54,7 @@ class Outcome:
         predictions: its, for each evaluated cloud; these and all scores are with
             `evaluation.prior`, estimates and validators without.
         prior: that one, of the reported net.
-        choice: how its epoch was chosen; None: the last one's, or the warm-up's.
+        choice: what chose its epoch; None: it is the last one's, or the warm-up's.
         final: its scores.
         scores: of "selected" and "last", the warm-up's epochs, and "student", the last round's.
         rotated: scores of the reported net and of "selected", averaged over rotations.
@@ -70,7 +70,7 @@ class Outcome:
     net: nn.Module
     predictions: Predictions
     prior: Prior | None
-    choice: Choice | None
+    choice: StudentSelection | None
     final: Scores
     scores: Mapping[str, Scores]
     rotated: tuple[Scores | None, Scores | None]
@@ -181,7 +181,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     nets, evaluation = SavedNets(run, loaded, built), loaded.evaluation
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
-    choice = None if built.student.rule == LAST else built.student.choice()
+    choice = None if built.student.rule == LAST else built.student
     last = "student" if run.scheme.rounds else "selected"
     file = choice.file if choice else files[last]
     net, device = nets(file), nets.device
@@ -259,7 +259,7 @@ def _quality(
 
 
 def without_labels(
-    table: Float[np.ndarray, "n c"], choice: Choice | None
+    table: Float[np.ndarray, "n c"], choice: StudentSelection | None
 ) -> dict[str, float | None]:
     """The reported net's scores by `qs3.evaluation.validators`, on the target's training clouds.
 
@@ -276,7 +276,7 @@ def without_labels(
         for name, one in LABEL_FREE.items()
         if name != "snd" or len(table) > 1
     }
-    if choice is not None and choice.rule == PSEUDO_VAL:
+    if choice is not None and choice.rule == PSEUDO_VAL and choice.score is not None:
         scores[PSEUDO_VAL] = choice.score
     return {name: score if math.isfinite(score) else None for name, score in scores.items()}
 

@@ -21,7 +21,7 @@ from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
 from qs3.methods.twin import Twin
 from qs3.selftraining.pcfea import Pcfea
-from qs3.selftraining.student_loss import Student
+from qs3.selftraining.student_selection import Student
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from qs3.methods.sd import Sd
 from qs3.models.base import ClassHead, PointClassifier
 from qs3.models.dgcnn import DGCNN
 from qs3.models.pointdan import pointdan
-from qs3.selftraining.student_loss import Student
+from qs3.selftraining.student_selection import Student
 from tests.methods import cases
 from tests.methods.cases import Case, batch_of, total
 from tests.unchecked import unchecked

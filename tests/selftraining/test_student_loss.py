@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3.selftraining.student_loss import Student, uniform_divergence
+from qs3.selftraining.student_selection import Student, uniform_divergence
 from tests.methods.shapes import tiny_net
 
 

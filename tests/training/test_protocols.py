@@ -12,12 +12,11 @@ from torch.nn import functional as F
 
 from qs3.config import hashing
 from qs3.datamodules.phases import Phases
-from qs3.engine.classifier import Classifier
-from qs3.engine.schedules import Plateau
+from qs3.engine.classifier import Classifier, Plateau
 from qs3.methods.base import class_loss
 from qs3.methods.bounds import SourceOnly
 from qs3.models.pointnet import pointnet, transform_regulariser
-from qs3.selftraining.student_loss import Student
+from qs3.selftraining.student_selection import Student
 from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.watching import interrupt
