@@ -28,6 +28,8 @@ from qs3.errors import DataError
 from qs3.utils.files import write_text
 from qs3.utils.progress import terminal_bar
 
+log = logging.getLogger(__name__)
+
 
 class EpochRows(Callback):
     """Sends epoch, phase, learning rate, loss and validation accuracy to the loggers.
@@ -123,9 +125,6 @@ class CsvHistory(Logger):
         except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
             raise DataError(f"{self.path} is damaged ({error})") from error
         return rows
-
-
-log = logging.getLogger(__name__)
 
 
 class EpochBar(Callback):

@@ -18,8 +18,8 @@ from qs3.datamodules.fps_samples import remove_old_leftovers
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
 from qs3.store.store import PointSet
-from qs3.training.code import changed_files, files_sha256
 from qs3.training.given import Given
+from qs3.training.reuse import changed_files, files_sha256
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
 from qs3.utils.version import VERSION, commit

@@ -11,10 +11,10 @@ import torch
 from omegaconf import OmegaConf
 
 from qs3.config import hashing
-from qs3.training import code
-from qs3.training.code import changed_files, files_sha256
+from qs3.training import reuse as code
 from qs3.training.command import train
 from qs3.training.provenance import versions, warn_of_changes
+from qs3.training.reuse import changed_files, files_sha256
 from qs3.training.shared_warmup import warmup_sha256
 
 NET = "from tests.training.toy import TinyNet\n\n\nclass Net(TinyNet):\n    pass\n"

@@ -12,7 +12,7 @@ from qs3.datamodules.clouds import Clouds
 from qs3.errors import DataError
 from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from qs3.training.command import train
-from qs3.training.real_sizes import check_real_sizes
+from qs3.training.load import check_real_sizes
 
 
 def boxes(*sizes: float, scale: str = "metres", lowest: float = 0.0) -> Clouds:
