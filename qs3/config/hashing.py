@@ -75,10 +75,6 @@ def config_sha256(cfg: DictConfig) -> str:
     if (plain.get("data") or {}).get("scale") != "above_floor":
         for key in _FLOORS:
             _leave_out(plain, key)
-    for domain in ("source", "target"):
-        node = (plain.get("data") or {}).get(domain)
-        if isinstance(node, dict) and node.get("views") == "stored":
-            _leave_out(plain, f"data.{domain}.views")
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None
         plain = _with_values(plain, cfg, "", _from(["selftraining"]))

@@ -5,7 +5,6 @@ Light on purpose: `train.py` asks `Domain.check` before it imports anything heav
 
 from __future__ import annotations
 
-import itertools
 import logging
 import os
 import shlex
@@ -56,8 +55,6 @@ class Domain:
             clouds that were normalised) or are not known.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
             where the camera is the origin; None: not known.
-        views: what training sees of a source: "stored", its clouds; "random", each time others of
-            the views and twins that its store keeps (`qs3.datamodules.random_views`).
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
         expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
@@ -77,7 +74,6 @@ class Domain:
     gravity: Literal["z", "none"] = "z"
     unit: Literal["metres", "none"] = "none"
     floor_m: float | None = None
-    views: Literal["stored", "random"] = "stored"
     how_to_get: str = ""
     make: str | None = None
     stand_in: str | None = None
@@ -86,8 +82,6 @@ class Domain:
     expected_counts: dict[str, list[int]] | None = None
 
     def __post_init__(self) -> None:
-        if self.views == "random" and self.variant != "points":
-            raise ConfigError(f"domain {self.name}: views=random needs variant=points")
         if len(set(self.names)) < max(1, len(self.names)):
             raise ConfigError(f"domain {self.name}: classes are {self.names}: empty or twice")
 
@@ -197,26 +191,6 @@ class Domain:
             text = "%s does not have the published numbers of clouds: %s"
             log.warning(text, self.label, ", ".join(problems))
         return replace(dataset, floor_m=self.floor_m)
-
-    def open_array(self, name: str, verify: bool = True) -> PointSet:
-        """The same clouds in another array of the store, such as "points_whole".
-
-        Raises:
-            DataError: the store lacks it.
-        """
-        if not self.has_array(name):
-            twin = "whole" if name == "points_whole" else "exact,views"
-            raise DataError(f"{self.folder} has no {name}.npy: generate it with twins=[{twin}]")
-        return replace(open_pointset(self.folder, name, verify=verify), floor_m=self.floor_m)
-
-    def has_array(self, name: str) -> bool:
-        """Whether the store has this array of clouds."""
-        return has_variant(self.folder, name)
-
-    def kept_views(self) -> list[str]:
-        """Names of the arrays of single views that the store keeps, in order; often none."""
-        names = (f"points_view{i}" for i in itertools.count())
-        return list(itertools.takewhile(self.has_array, names))
 
     def check_unpublished(self) -> None:
         """Raise DataError if published files are there: a dataset made here would pass for them."""
