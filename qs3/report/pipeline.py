@@ -193,29 +193,26 @@ def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
 def view_images(view: KeptView) -> list[Picture]:
     """Both images, disparity and depth of a view, with their titles."""
     frame, images = view.frame, view.frame.images
+    second = "infrared, right" if "right" in images else "stored picture of the pattern"
+    shown = (
+        (f"view {view.number}: infrared", photograph(images), "", "gray"),
+        (second, images.get("right", images.get("reference")), "", "gray"),
+        ("disparity", images.get("disparity"), "px", "viridis"),
+        ("depth as measured", frame.depth_m, "m", "viridis_r"),
+    )
     found: list[Picture] = []
-    left, second = photograph(images), images.get("right", images.get("reference"))
-    name = "infrared, right" if "right" in images else "stored picture of the pattern"
-    for title, image in ((f"view {view.number}: infrared", left), (name, second)):
-        if image is None:
-            found.append((f"{title}: none", None))
-            continue
-        grey = np.where(np.isfinite(image), image, 0).astype(np.float64)
-        high = float(np.percentile(grey[grey > 0], 99)) if (grey > 0).any() else 1.0
-        # A gamma, as a screen has one: the surface between the dots would be black.
-        shown = value_image((grey / high).clip(0, 1) ** 0.6, 0, 1, "gray")
-        found.append((f"{title}\n{image.shape[1]} x {image.shape[0]} px", shown))
-    maps = {"disparity": (images.get("disparity"), "px", "viridis"),
-            "depth as measured": (frame.depth_m, "m", "viridis_r")}  # fmt: skip
-    for title, (values, unit, colours) in maps.items():
+    for title, values, unit, colours in shown:
         if values is None or not np.isfinite(values).any():
             found.append((f"{title}: none", None))
             continue
+        values = values.astype(np.float64)
         low, high = np.percentile(values[np.isfinite(values)], [1, 99])
-        words = f"{title}\n{low:.2f} (blue) to {high:.2f} {unit} (yellow)"
-        if colours.endswith("_r"):
-            words = f"{title}\n{low:.2f} (yellow) to {high:.2f} {unit} (blue)"
-        found.append((words, value_image(values, low, high, colours)))
+        ends = ("blue", "yellow") if colours == "viridis" else ("yellow", "blue")
+        words = f"{low:.2f} ({ends[0]}) to {high:.2f} {unit} ({ends[1]})"
+        if not unit:  # a gamma, as a screen has one: the surface between the dots would be black
+            values = (values / max(high, 1e-12)).clip(0, 1) ** 0.6
+            low, high, words = 0, 1, f"{values.shape[1]} x {values.shape[0]} px"
+        found.append((f"{title}\n{words}", value_image(values, low, high, colours)))
     return found
 
 

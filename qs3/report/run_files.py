@@ -6,7 +6,6 @@ What an unfinished run does not have is None.
 from __future__ import annotations
 
 import dataclasses
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,6 @@ from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import (
     Predictions,
     PseudoLabel,
-    pseudo_labels_path,
     read_predictions,
     read_pseudo_labels,
 )
@@ -122,10 +120,8 @@ def read_run(folder: str | Path) -> RunFiles:
     if (folder / PREDICTIONS).is_file():
         predictions = read_predictions(folder / PREDICTIONS)
     records = {record.round: record for record in (metrics.rounds if metrics else [])}
-    found = (re.fullmatch(r"round_(\d+)", path.name) for path in folder.glob("round_*"))
-    numbers = {int(match[1]) for match in found if match}
-    tables = {n: read_pseudo_labels(pseudo_labels_path(folder, n)) for n in numbers
-              if pseudo_labels_path(folder, n).is_file()}  # fmt: skip
+    files = folder.glob("round_[0-9]*/pseudo_labels.csv")
+    tables = {int(path.parent.name[6:]): read_pseudo_labels(path) for path in files}
     rounds = tuple(Round(n, records.get(n), tables.get(n)) for n in sorted({*records, *tables}))
     if predictions is not None:
         classes = predictions.classes

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.config.compose import choices
-from qs3.datasets.clouds import SUFFIXES, checked, parse_clouds, with_depth
+from qs3.datasets.clouds import SUFFIXES, CloudFile, checked, parse_clouds, with_depth
 from qs3.datasets.importing import turned
 from qs3.datasets.object_archive import JUDGE, is_archive, read_archive
 from qs3.errors import DataError, MissingDataError
@@ -95,9 +95,7 @@ def _files(place: Path, most: int, wanted: Wanted) -> Part:
     failed: list[str] = []
     with progress_bar("files", total=len(few)) as advance:
         for i in few:
-            name = printable(names[i])
-            read = _of_mesh if is_mesh(files[i]) else _of_file
-            for one in read(files[i], name, wanted, len(few)):
+            for one in _of_file(files[i], printable(names[i]), wanted, len(few)):
                 if isinstance(one, Shown):
                     shown.append(one)
                 else:
@@ -108,30 +106,21 @@ def _files(place: Path, most: int, wanted: Wanted) -> Part:
     return Part(kept, f"{about}, {len(kept)} of {len(shown)} clouds", failed=failed)
 
 
-def _of_mesh(path: Path, name: str, wanted: Wanted, files: int) -> Iterator[Shown | str]:
-    """Samples of a surface, as its vertices alone show little; or why there are none."""
-    count = points_each(files, wanted.points)
-    try:
-        mesh = load_mesh(path)
-        cloud = surface_sample(mesh.vertices, mesh.faces, count, np.random.default_rng(0))
-        cloud = checked(cloud, name)
-    except DataError as error:
-        yield f"{name}: {error}"
-        return
-    if path.suffix.lower() not in DECLARE_UP:
-        cloud = turned(cloud, wanted.up)
-    yield Shown(
-        name, cloud, label=Path(name).parent.name, note=f"samples of {len(mesh.faces)} faces"
-    )
-
-
 def _of_file(path: Path, name: str, wanted: Wanted, files: int) -> Iterator[Shown | str]:
-    """A file's clouds, or why one cannot be shown.
+    """A file's clouds, of a mesh samples of its surface; or why one cannot be shown.
 
     Their class is that of the file, else the name of the file's folder.
     """
+    note, up = "", wanted.up
     try:
-        found = parse_clouds(path)
+        if is_mesh(path):
+            mesh, count = load_mesh(path), points_each(files, wanted.points)
+            cloud = surface_sample(mesh.vertices, mesh.faces, count, np.random.default_rng(0))
+            found = CloudFile((cloud,))
+            note = f"samples of {len(mesh.faces)} faces"
+            up = "z" if path.suffix.lower() in DECLARE_UP else up
+        else:
+            found = parse_clouds(path)
     except DataError as error:
         yield f"{name}: {error}"
         return
@@ -141,9 +130,9 @@ def _of_file(path: Path, name: str, wanted: Wanted, files: int) -> Iterator[Show
         words = label.decode(errors="replace") if isinstance(label, bytes) else str(label)
         try:
             seen, dropped = with_depth(given, own)
-            cloud = turned(checked(seen, own), wanted.up)
+            cloud = turned(checked(seen, own), up)
         except DataError as error:
             yield f"{own}: {error}"
             continue
-        note = f"{dropped} points without depth left out" if dropped else ""
-        yield Shown(own, cloud, label=printable(words), note=note)
+        lost = f"{dropped} points without depth left out" if dropped else note
+        yield Shown(own, cloud, label=printable(words), note=lost)

@@ -133,16 +133,10 @@ def _data(shown: Sequence[Shown], colour: str) -> dict[str, Any]:
     most = _nice(float(np.quantile(residuals, _RESIDUAL_SHARE))) if len(residuals) else 1.0
     classes = sorted({name for one in shown for name in (one.label or one.called,) if name})
     views = sorted({int(k) for one in shown if one.view is not None for k in np.unique(one.view)})
-    modes = ["height"] + [
-        mode
-        for mode, there in (
-            ("view", bool(views)),
-            ("residual", bool(known)),
-            ("class", bool(classes)),
-            ("confidence", any(one.sure is not None for one in shown)),
-        )
-        if there
-    ]
+    sure = [one for one in shown if one.sure is not None]
+    known_of = {"height": True, "view": views, "residual": known, "class": classes,
+                "confidence": sure}  # fmt: skip
+    modes = [mode for mode, there in known_of.items() if there]
     return {
         "clouds": [_cloud(one, most) for one in shown],
         "start": {"azimuth": AZIMUTH_DEG, "elevation": ELEVATION_DEG},
