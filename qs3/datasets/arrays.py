@@ -146,6 +146,7 @@ class ScanObjectNN(Importer):
 
     variant: str = ""
     complete: ClassVar[bool] = False
+    up: ClassVar[str] = "y"
 
     def looks_for(self) -> str:
         """See `Importer`."""
@@ -163,21 +164,13 @@ class ScanObjectNN(Importer):
         log.info("%s: clouds of other classes left out: %d", self.root, len(items) - len(ours))
         return by_class(ours, classes)
 
-    def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
-        """See `Importer`."""
-        return turned(cloud, "y")
-
     def _files(self) -> list[tuple[str, Path]]:
         name = f"objectdataset{self.variant}.h5"
         return [("train", self.root / f"training_{name}"), ("test", self.root / f"test_{name}")]
 
 
 def h5_items(path: Path, split: str, names: Sequence[str], digits: int) -> list[Item]:
-    """The clouds of one file, in its order; `names` of the classes by label.
-
-    Raises:
-        DataError: damaged, or a label out of range.
-    """
+    """The clouds of one file, in its order; `names` of the classes by label."""
     data, labels = read_h5(path)
     if len(labels) != len(data) or (labels < 0).any() or (labels >= len(names)).any():
         raise DataError(f"{path}: {len(data)} clouds, and labels that are not 0..{len(names) - 1}")

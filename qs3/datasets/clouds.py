@@ -109,17 +109,12 @@ def parse_clouds(path: str | Path) -> CloudFile:
     with reading(path), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         found = reader(path)
-        if not found.clouds or not len(found.clouds[0]):
-            raise ValueError("there are no points")
+        assert sum(map(len, found.clouds[:1])), "there are no points"
     return found
 
 
 def parse_cloud(path: str | Path) -> np.ndarray:
-    """[n, 3] as they are in the file: the one cloud in it; see `parse_clouds`.
-
-    Raises:
-        DataError: names the file; also if it holds several clouds.
-    """
+    """[n, 3] as they are in the file: the one cloud in it; see `parse_clouds`."""
     found = parse_clouds(path)
     if len(found.clouds) != 1:
         raise DataError(f"{path} holds {len(found.clouds)} clouds, expected one")
@@ -127,11 +122,7 @@ def parse_cloud(path: str | Path) -> np.ndarray:
 
 
 def npy_clouds(path: Path) -> int | None:
-    """How many clouds an .npy file is made for, without reading them; None: a single one.
-
-    Raises:
-        DataError: as `parse_clouds`.
-    """
+    """How many clouds an .npy file is made for, without reading them; None: a single one."""
     with reading(path):
         found = _of_array(np.load(path, mmap_mode="r", allow_pickle=False))
     return len(found.clouds) if found.many else None
@@ -140,21 +131,13 @@ def npy_clouds(path: Path) -> int | None:
 def read_arrays(
     path: Path, required: Sequence[str], optional: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
-    """Some arrays of an .npz; nothing in it is unpickled.
-
-    Raises:
-        DataError: damaged, or an array is missing.
-    """
+    """Some arrays of an .npz; nothing in it is unpickled."""
     with reading(path), open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
         return {key: file[key] for key in (*required, *(k for k in optional if k in file))}
 
 
 def read_pcd(path: Path) -> Float[np.ndarray, "h w 3"]:
-    """Positions of a PCD file, NaN where nothing was measured; h is 1 unless it is organised.
-
-    Raises:
-        DataError: damaged, or without x, y and z.
-    """
+    """Positions of a PCD file, NaN where nothing was measured; h is 1 unless it is organised."""
     from pypcd4 import PointCloud
 
     with reading(path):
@@ -173,15 +156,12 @@ def check_shape(where: Any, shape: tuple[int, ...]) -> None:
     Raises:
         DataError: transposed (x y z are rows), or rather a depth image; begins with `where`.
     """
-    if len(shape) not in (2, 3) or shape[-1] < 3:
-        raise DataError(f"{where}: shape {shape}, expected [n, 3] or [m, n, 3]")
-    rows, columns = shape[-2:]
-    if (rows == 3 and columns > _FEW) or (rows <= _FEW and columns > _MOST_COLUMNS):
-        raise DataError(f"{where}: shape {shape}: is it transposed? A point is a row x y z")
-    if columns > _MOST_COLUMNS or (len(shape) == 3 and shape[:2] in _PICTURES):
+    rows, columns = shape[-2:] if len(shape) in (2, 3) else (0, 0)
+    picture = columns > _MOST_COLUMNS or (len(shape) == 3 and shape[:2] in _PICTURES)
+    if columns < 3 or picture or (rows == 3 and columns > _FEW):
         raise DataError(
-            f"{where}: shape {shape} looks like a picture: give a depth image as depth=, and one "
-            "organised cloud as cloud.reshape(-1, 3)"
+            f"{where}: shape {shape}, expected points as rows, [n, 3] or [m, n, 3]; give a depth "
+            "image as depth=, and one organised cloud as cloud.reshape(-1, 3)"
         )
 
 
@@ -261,11 +241,7 @@ def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
 
 
 def _separator(row: str) -> str | None:
-    """What stands between the numbers of a row; None: blanks.
-
-    Raises:
-        ValueError: commas may stand between numbers or within: 1,000.5 2,000.5.
-    """
+    """What stands between the numbers of a row; None: blanks."""
     row = row.rstrip(_ENDS)
     together = re.sub(r"[ \t]*,[ \t]*", ",", row)
     if "," in row and not re.search(r"[;\s]", together):
@@ -344,13 +320,11 @@ def _of_array(array: np.ndarray, labels: np.ndarray | None = None) -> CloudFile:
     if array.dtype.names:
         fields = {name.lower(): name for name in array.dtype.names}
         array = np.stack([array[fields[axis]] for axis in _XYZ], axis=-1)
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"the array holds {array.dtype}, not numbers")
+    assert array.dtype.kind in "fiu", f"the array holds {array.dtype}, not numbers"
     check_shape("the array", array.shape)
     many = array.ndim == 3
     clouds = array[..., :3] if many else array[None, :, :3]
-    if labels is not None and labels.shape != (len(clouds),):
-        raise ValueError(f"{len(clouds)} clouds, but the labels have the shape {labels.shape}")
+    assert labels is None or labels.shape == (len(clouds),), f"labels {labels.shape}"
     return CloudFile(tuple(clouds), None if labels is None else tuple(labels.tolist()), many)
 
 

@@ -155,14 +155,8 @@ def read_depth(
         of_camera: `depth_scale` of the file of intrinsics. Millimetres a unit (BOP), metres a unit
             (librealsense) and units a metre (Open3D) are called so, so that it is not used, but
             whole numbers that are not millimetres by it are refused.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: damaged, without any depth, or in another unit.
     """
     found = _image(Path(path), "fiu")
-    if found.dtype == np.uint8:
-        raise DataError(f"{path}: 8 bits a pixel are a picture of depths; expected 16 bits")
     whole = found.dtype.kind in "iu"
     scale = scale_m if scale_m is not None else MILLIMETRE if whole else 1.0
     depth = found.astype(np.float64) * scale
@@ -171,10 +165,11 @@ def read_depth(
         depth[found == _UNMEASURED] = 0
     middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
     known = of_camera is None or any(abs(of_camera / one - 1) < 1e-3 for one in _MILLIMETRES)
-    if not 0.02 < middle < MOST_DEPTH_M or (whole and scale_m is None and not known):
+    picture = found.dtype == np.uint8  # of depths
+    if picture or not 0.02 < middle < MOST_DEPTH_M or (whole and scale_m is None and not known):
         raise DataError(
-            f"{path}: the median depth is {middle:.3g} m with {scale:g} m a unit (depth_scale in "
-            f"the intrinsics' file: {of_camera}); depth_scale=METRES gives the metres of a unit"
+            f"{path}: {found.dtype}, median depth {middle:.3g} m with {scale:g} m a unit (the "
+            f"intrinsics' file has {of_camera}); depth_scale=METRES gives the metres of a unit"
         )
     return depth
 
@@ -187,21 +182,12 @@ def check_metres(depth_m: Float[np.ndarray, "h w"], where: str) -> None:
 
 
 def read_mask(path: str | Path) -> Int[np.ndarray, "h w"]:
-    """Number of the object that each pixel shows, int64; 0 where it shows none.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: damaged, empty, or not a mask.
-    """
+    """Number of the object that each pixel shows, int64; 0 where it shows none."""
     return checked_mask(_image(Path(path), "iub"), str(path))
 
 
 def checked_mask(mask: np.ndarray, where: str) -> Int[np.ndarray, "h w"]:
-    """A mask of whole numbers or bool as int64.
-
-    Raises:
-        DataError: of another kind or shape, empty, or with too many numbers; begins with `where`.
-    """
+    """A mask of whole numbers or bool as int64."""
     numbers: np.ndarray = mask.astype(np.int64)
     count = int((np.unique(numbers) != 0).sum())
     if mask.ndim != 2 or mask.dtype.kind not in "iub" or not 0 < count <= _MOST_OBJECTS:
@@ -215,10 +201,6 @@ def read_intrinsics(words: str, folder: Path | None = None) -> Intrinsics:
     Args:
         words: numbers, or a path.
         folder: that a path is relative to.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: it holds no intrinsics.
     """
     if numbers := _numbers(words):
         return Intrinsics(camera_of(numbers, f"intrinsics={words}"))
@@ -238,11 +220,7 @@ def read_intrinsics(words: str, folder: Path | None = None) -> Intrinsics:
 
 
 def camera_of(values: Sequence[float], where: str) -> Pinhole:
-    """From fx fy cx cy, or the 9 or 16 numbers of a matrix.
-
-    Raises:
-        DataError: other numbers; begins with `where`.
-    """
+    """From fx fy cx cy, or the 9 or 16 numbers of a matrix."""
     values = list(values)
     if len(values) == 16:
         values = [*values[:3], *values[4:7], *values[8:11]]
@@ -258,12 +236,7 @@ def camera_of(values: Sequence[float], where: str) -> Pinhole:
 
 
 def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where: str) -> Pinhole:
-    """The camera, if it can have taken a picture of this size.
-
-    Raises:
-        DataError: another size, a principal point outside of the picture, or focal lengths in
-            another unit; begins with `where`.
-    """
+    """The camera, if it can have taken a picture of this size."""
     height, width = depth_m.shape
     camera = given.camera
     sides = np.array([width / camera.fx_px, height / camera.fy_px])
@@ -310,8 +283,8 @@ def _image(path: Path, kinds: str) -> np.ndarray:
         else:
             with Image.open(path) as image:
                 found = np.asarray(image)
-        if found.ndim != 2 or found.dtype.kind not in kinds:
-            raise ValueError(f"{found.dtype} {found.shape}, expected one number a pixel")
+        assert found.ndim == 2, f"shape {found.shape}"
+        assert found.dtype.kind in kinds, f"numbers of {found.dtype}"
     return found
 
 

@@ -5,6 +5,7 @@ Light on purpose: `train.py` asks `Domain.check` before it imports anything heav
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import shlex
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from qs3.classes import class_list
-from qs3.config.compose import choices, composed
+from qs3.config.compose import composed
 from qs3.config.location import python_command, typed
 from qs3.datasets.importing import Importer, import_into
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
@@ -55,6 +56,8 @@ class Domain:
             clouds that were normalised) or are not known.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
             where the camera is the origin; None: not known.
+        views: what training sees of a source: "stored", its clouds; "random", each time others of
+            the views and twins that its store keeps (`qs3.datamodules.random_views`).
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
         expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
@@ -74,6 +77,7 @@ class Domain:
     gravity: Literal["z", "none"] = "z"
     unit: Literal["metres", "none"] = "none"
     floor_m: float | None = None
+    views: Literal["stored", "random"] = "stored"
     how_to_get: str = ""
     make: str | None = None
     stand_in: str | None = None
@@ -82,6 +86,8 @@ class Domain:
     expected_counts: dict[str, list[int]] | None = None
 
     def __post_init__(self) -> None:
+        if self.views == "random" and self.variant != "points":
+            raise ConfigError(f"domain {self.name}: views=random needs variant=points")
         if len(set(self.names)) < max(1, len(self.names)):
             raise ConfigError(f"domain {self.name}: classes are {self.names}: empty or twice")
 
@@ -192,6 +198,19 @@ class Domain:
             log.warning(text, self.label, ", ".join(problems))
         return replace(dataset, floor_m=self.floor_m)
 
+    def open_array(self, name: str, verify: bool = True) -> PointSet:
+        """The same clouds in another array of the store, such as "points_whole"."""
+        return replace(open_pointset(self.folder, name, verify=verify), floor_m=self.floor_m)
+
+    def has_array(self, name: str) -> bool:
+        """Whether the store has this array of clouds."""
+        return has_variant(self.folder, name)
+
+    def kept_views(self) -> list[str]:
+        """Names of the arrays of single views that the store keeps, in order; often none."""
+        names = (f"points_view{i}" for i in itertools.count())
+        return list(itertools.takewhile(self.has_array, names))
+
     def check_unpublished(self) -> None:
         """Raise DataError if published files are there: a dataset made here would pass for them."""
         importer = self.importer()
@@ -239,11 +258,7 @@ class Domain:
 
 
 def check_all(*domains: Domain) -> None:
-    """Check several domains, and list all that are missing at once.
-
-    Raises:
-        MissingDataError: as `Domain.check`, for each one that is not there.
-    """
+    """Check several domains, and list all that are missing at once."""
     problems = []
     for domain in {domain.name: domain for domain in domains}.values():
         try:
@@ -269,10 +284,6 @@ def make_if_missing(domain: Domain) -> None:
     """Run `generate.py` for a domain whose data are not there; it shows its progress.
 
     An interrupted one goes on where it stopped when it is called again.
-
-    Raises:
-        MissingDataError: the domain is published, not generated.
-        Qs3Error: the generation failed; its message is on the terminal.
     """
     try:
         domain.check()
@@ -290,14 +301,7 @@ def make_if_missing(domain: Domain) -> None:
 
 
 def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
-    """conf/domain/NAME.yaml with changes, instantiated.
-
-    Raises:
-        ConfigError: there is no such domain, or no such key.
-    """
-    known = choices("domain")
-    if name not in known:
-        raise ConfigError(f"domain={name} is unknown; there are {', '.join(known)}, or a folder")
+    """conf/domain/NAME.yaml with changes, instantiated."""
     words = [
         f"{key if key.startswith('paths.') else f'domain.{key}'}={value}"
         for key, value in overrides.items()

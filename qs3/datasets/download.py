@@ -21,7 +21,7 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
-from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.errors import DataError, Qs3Error
 from qs3.utils.files import make_folder, reading, sha256_file, write_json
 from qs3.utils.locks import locked
 
@@ -138,8 +138,6 @@ def provide(
     if source.agreement and accept_terms != source.agreement:
         text, where = _FILE["agreements"][source.agreement], f" into={into}"
         raise AgreementError(text.format(name=source.name, where=where, title=source.title))
-    if root and len(source.parts) > 1:
-        raise ConfigError(f"{source.name} has several parts, so root= cannot be given")
     downloads, published = make_folder(into / "downloads"), into / "published"
     places = {part: published / part.folder for part in source.parts}
     with locked(downloads / f".{source.name}.lock"):
@@ -152,11 +150,7 @@ def provide(
 
 
 def fetch(source: Source, path: Path, mirror: str = "") -> Path:
-    """Bring a source's archive to `path`; one that is there already is checked and left alone.
-
-    Raises:
-        DownloadError: network, or another file.
-    """
+    """Bring a source's archive to `path`; one that is there already is checked and left alone."""
     import pooch
     import requests
 
@@ -195,9 +189,6 @@ def unpack(archive: Path, into: Path) -> list[str]:
 
     Returns:
         The files, relative to `into`, with slashes.
-
-    Raises:
-        DataError: damaged, or not to be trusted.
     """
     with reading(archive):
         if zipfile.is_zipfile(archive):
@@ -215,9 +206,6 @@ def find_folder(files: Iterable[str], holds: str, named: str = "", at_least: int
 
     For `holds`, `named` and `at_least` see `Part`. `files` and the result are relative to the
     archive's top, with slashes; "" is the top itself.
-
-    Raises:
-        DataError: there is none, or there are several.
     """
     name = rf"(?:.*/)?(?i:{named})/" if named else r"(?:.*/)?"
     pattern = re.compile(rf"(?P<root>{name}){holds}")

@@ -39,14 +39,13 @@ from qs3.datasets.importing import (
     files_in,
     folders_in,
     split_of,
-    thinned,
-    turned,
     unique,
     visible,
 )
-from qs3.errors import DataError, MeshError
+from qs3.errors import DataError
 from qs3.store.manifest import SPLITS, ManifestRow
 from qs3.store.meta import MadeOf
+from qs3.utils.files import reading
 from qs3.utils.seeding import derive
 from qs3.utils.settings import settings
 
@@ -95,7 +94,7 @@ class PublishedTree(Importer):
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        return cloud if cls in self.up_z_classes else turned(cloud, self.up)
+        return cloud if cls in self.up_z_classes else super().turn(cloud, cls)
 
     def object_of(self, id_: str) -> str:
         """See `Importer`: the room, of ScanNet's ids such as "chair/test/scene0011_01_7".
@@ -234,6 +233,7 @@ class CloudFolder(Importer):
     up: UpAxis = "z"
     test_every: Annotated[int, Ge(0)] = 5
     complete: ClassVar[bool] = False
+    thins: ClassVar[bool] = True
 
     def made_of(self) -> MadeOf:
         """See `Importer`."""
@@ -249,11 +249,7 @@ class CloudFolder(Importer):
         return next(_files(self.root), None) is not None
 
     def items(self, classes: Sequence[str]) -> list[Item]:
-        """See `Importer`. Sorted by split, class and name.
-
-        Raises:
-            DataError: an unknown class, two files of one name, or mixed layouts.
-        """
+        """See `Importer`. Sorted by split, class and name."""
         layout = self._layout(classes)
         log.info("%s is read in the layout %s", self.root, layout)
         read = functools.lru_cache(maxsize=1)(parse_clouds)  # one file in memory at a time
@@ -277,14 +273,6 @@ class CloudFolder(Importer):
             name = path.relative_to(self.root).as_posix()
             digest.update(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode())
         return {**super().settings(), "files": digest.hexdigest()}
-
-    def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
-        """See `Importer`: at most P points, the farthest."""
-        return thinned(cloud, self.points)
-
-    def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
-        """See `Importer`."""
-        return turned(cloud, self.up)
 
     def _layout(self, classes: Sequence[str]) -> str:
         """The layout in the names of the folders; DataError if they fit none."""
@@ -370,19 +358,13 @@ def list_tree(
 
 
 def sample_file(path: Path, points: int, seed: int) -> np.ndarray:
-    """[points, 3] float32, uniform on the surface in one mesh file, in the file's axes and units.
-
-    Raises:
-        MeshError: the file is damaged or has no surface; names the file.
-    """
+    """[points, 3] float32, uniform on the surface of a mesh file, in its axes and units."""
     from qs3.geometry.sampling import surface_sample
     from qs3.meshes.io import load_mesh
 
-    mesh = load_mesh(path)
-    try:
+    with reading(path):
+        mesh = load_mesh(path)
         cloud = surface_sample(mesh.vertices, mesh.faces, points, np.random.default_rng(seed))
-    except MeshError as error:
-        raise MeshError(f"{path}: {error}") from error
     return cloud.astype(np.float32)
 
 

@@ -132,8 +132,8 @@ class FrameDataset(Importer):
         return all(path.is_file() for path in self.files())
 
     def items(self, classes: Sequence[str]) -> list[Item]:
-        """Not used: frames are cut, not listed."""
-        raise NotImplementedError
+        """None: frames are cut, not listed."""
+        return []
 
     def object_of(self, id_: str) -> str:
         """See `Importer`: the room, or the block of frames; things in one room are not independent.
@@ -153,12 +153,7 @@ class FrameDataset(Importer):
     def read(
         self, classes: Sequence[str], work: Path
     ) -> tuple[list[np.ndarray], list[ManifestRow]]:
-        """See `Importer`: cuts what is not cut yet, then puts all together.
-
-        Raises:
-            ConfigError: a name or a limit of a class that there is not.
-            DataError: a file is damaged, or nothing was cut.
-        """
+        """See `Importer`: cuts what is not cut yet, then puts all together."""
         limited = {*self.rules.limits} - {"default"}
         if unknown := sorted({*self.names.values(), *limited} - {*classes}):
             raise ConfigError(f"published.names or rules.limits: unknown classes {unknown}")
@@ -175,8 +170,6 @@ class FrameDataset(Importer):
         found.sort(key=lambda f: (SPLITS.index(f[0].split), label.get(f[0].cls, -1), f[0].id))
         rows = [row for row, _ in found]
         clouds = [cloud for row, cloud in found if row.status == OK and cloud is not None]
-        if not clouds:
-            raise DataError(f"{self.root}: no object of {len(tasks)} frames can be used")
         tiers = Counter(row.more["tier"] for row in rows if row.status == OK)
         log.info("%s: objects cut: %s", self.root, dict(sorted(tiers.items())))
         report(rows, self.points, self.root)
@@ -264,12 +257,7 @@ def finish_parts(
 
 
 def load_mat(path: Path) -> dict[str, Any]:
-    """The variables of a MATLAB file of version 5 to 7; structs are dicts, cells are lists.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: damaged, or of another format.
-    """
+    """The variables of a MATLAB file of version 5 to 7; structs are dicts, cells are lists."""
     from scipy.io import loadmat
 
     with reading(path):

@@ -82,6 +82,9 @@ class Importer(abc.ABC):
     complete: ClassVar[bool] = True
     """Whether a class without clouds in a split means that something is wrong."""
 
+    thins: ClassVar[bool] = False
+    """Whether larger clouds become their farthest points; else they are an error."""
+
     @property
     def root(self) -> Path:
         """The folder as an absolute path."""
@@ -97,11 +100,7 @@ class Importer(abc.ABC):
 
     @abc.abstractmethod
     def items(self, classes: Sequence[str]) -> list[Item]:
-        """Everything there is, in the dataset's order.
-
-        Raises:
-            DataError: names the file or folder that does not fit the format.
-        """
+        """Everything there is, in the dataset's order."""
 
     def made_of(self) -> MadeOf:
         """What the store is made of; goes into its meta.yaml."""
@@ -120,12 +119,8 @@ class Importer(abc.ABC):
         return ""
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
-        """[P, 3] as published to [P, 3] with z up."""
-        return cloud
-
-    def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
-        """[n, 3] as read to at most P points, for formats that allow more."""
-        return cloud
+        """[P, 3] as published, with the axis `up` of the importer up, to [P, 3] with z up."""
+        return turned(cloud, getattr(self, "up", "z"))
 
     def read(
         self, classes: Sequence[str], work: Path
@@ -136,16 +131,13 @@ class Importer(abc.ABC):
             classes: the names in label order.
             work: a folder in which an importer that takes minutes may keep what it has done, to
                 continue after an interruption; it is deleted when the store is finished.
-
-        Raises:
-            DataError: names the file, and the line or item; or a class does not occur in a split,
-                if the dataset is `complete`.
         """
         clouds, rows = [], []
         for row, where, load in shown(self.items(classes), f"importing {self.root.name}"):
             try:
                 raw = load()
-                cloud = check_cloud(self.thin(raw, where), self.points, where)
+                cloud = thinned(raw, self.points) if self.thins else raw
+                cloud = check_cloud(cloud, self.points, where)
             except DataError as error:
                 if self.on_error == "stop":
                     raise
@@ -219,11 +211,7 @@ def file_item(
 
 
 def unique(items: Iterable[Item]) -> list[Item]:
-    """The items themselves, if their ids differ by more than case: not all systems tell it.
-
-    Raises:
-        DataError: names two files of one id.
-    """
+    """The items themselves, if their ids differ by more than case: not all systems tell it."""
     found: dict[str, Item] = {}
     for item in items:
         other = found.setdefault(item.row.id.casefold(), item)
@@ -273,11 +261,7 @@ def files_in(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
 
 
 def check_cloud(cloud: np.ndarray, points: int, where: str) -> Float[np.ndarray, "P 3"]:
-    """[P, 3] float32 from [n, 3] with 1 <= n <= P, filled up by repeating from the first point.
-
-    Raises:
-        DataError: wrong shape, no points, more than P, or a value that is not finite.
-    """
+    """[P, 3] float32 from [n, 3] with 1 <= n <= P, filled up by repeating from the first point."""
     if cloud.ndim != 2 or cloud.shape[1] != 3 or not 1 <= len(cloud) <= points:
         raise DataError(f"{where}: shape {cloud.shape}, expected 1 to {points} points x y z")
     with np.errstate(over="ignore"):  # becomes infinite, and is reported as such

@@ -76,11 +76,7 @@ class Joined(Importer):
         return {**super().settings(), "files": digest.hexdigest()}
 
     def items(self, classes: Sequence[str]) -> list[Item]:
-        """See `Importer`; sorted by split, class and id.
-
-        Raises:
-            DataError: a dataset has other classes, or stands twice in the list.
-        """
+        """See `Importer`; sorted by split, class and id."""
         scans: Counter[str] = Counter()
         found = []
         for name, folder in zip(self.datasets, self.stores, strict=True):

@@ -74,12 +74,7 @@ class LabelledFrames:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file; images are read when they are asked for.
-
-        Raises:
-            MissingDataError: there is no such file.
-            DataError: it is broken off, damaged, or something else.
-        """
+        """Open the file; images are read when they are asked for."""
         import h5py
 
         self.path = path
@@ -92,8 +87,7 @@ class LabelledFrames:
                 self.scenes = self._words("scenes")
             if "accelData" in self._file:
                 self.accelerations = np.asarray(self._file["accelData"][:3].T, dtype=np.float64)
-            if {len(self.scenes), len(self.accelerations)} != {self._n}:
-                raise ValueError(f"other numbers of scenes or readings than of {self._n} frames")
+            assert len(self.scenes) == len(self.accelerations) == self._n
 
     def __enter__(self) -> LabelledFrames:
         return self
@@ -138,19 +132,14 @@ class LabelledFrames:
 
 
 def read_splits(path: Path, frames: int) -> list[str]:
-    """The split of each frame: "train", "test", or "" if it is in neither list.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: it is damaged, or names a frame that there is not, or one twice.
-    """
+    """The split of each frame: "train", "test", or "" if it is in neither list."""
     found = load_mat(path)
     splits = [""] * frames
     with reading(path):
         for name, split in (("trainNdxs", "train"), ("testNdxs", "test")):
             for number in np.ravel(found[name]).astype(np.int64).tolist():
-                if not 1 <= number <= frames or splits[number - 1]:
-                    raise ValueError(f"{name}: frame {number} of {frames}, or twice")
+                assert 1 <= number <= frames, f"frame {number} of {frames}"
+                assert not splits[number - 1], f"frame {number} twice"
                 splits[number - 1] = split
     return splits
 

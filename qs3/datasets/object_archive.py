@@ -34,7 +34,7 @@ from annotated_types import Ge
 from jaxtyping import Float
 
 from qs3.datasets.clouds import read_arrays
-from qs3.datasets.importing import Importer, Item, by_class, class_of, thinned
+from qs3.datasets.importing import Importer, Item, by_class, class_of
 from qs3.errors import ConfigError, DataError
 from qs3.store.manifest import ManifestRow
 from qs3.store.meta import MadeOf
@@ -132,6 +132,7 @@ class ObjectArchive(Importer):
     tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: ["clean", "hard"])
 
     complete: ClassVar[bool] = False
+    thins: ClassVar[bool] = True
 
     @property
     def path(self) -> Path:
@@ -184,10 +185,6 @@ class ObjectArchive(Importer):
         """See `Importer`: the block of frames."""
         return id_.rsplit("/", 1)[-1].rsplit("_", 2)[0]
 
-    def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
-        """See `Importer`: at most P points, the farthest."""
-        return thinned(cloud, self.points)
-
     def settings(self) -> dict[str, Any]:
         """See `Importer`; the file by what it holds: a copy of it elsewhere is the same archive."""
         values = super().settings()
@@ -195,12 +192,7 @@ class ObjectArchive(Importer):
         return {**values, "files": _contents(self.path) if self.path.is_file() else ""}
 
     def _splits(self, archive: Archive) -> list[str]:
-        """The split of each object; "" for those that are left out.
-
-        Raises:
-            ConfigError: the file has no part of a name that was asked for.
-            DataError: the file has no parts to make folds of.
-        """
+        """The split of each object; "" for those that are left out."""
         asked = {*self.train_parts, *self.test_parts}
         if unknown := sorted(asked - {*archive.parts, ADAPT, JUDGE}):
             raise ConfigError(
@@ -214,11 +206,7 @@ class ObjectArchive(Importer):
             return [split.get(str(part), "") for part in archive.dev]
         ours, frames = np.isin(archive.dev, self.train_parts), archive.frame
         blocks = np.unique(frames[ours] // self.block)
-        if len(blocks) < self.folds or self.fold >= self.folds:
-            raise DataError(
-                f"{self.path}: fold {self.fold} of {self.folds}, and {len(blocks)} blocks of "
-                f"frames in {' or '.join(self.train_parts)}"
-            )
+        assert self.fold < self.folds <= len(blocks), f"{len(blocks)} blocks of frames"
         tested = np.array_split(blocks, self.folds)[self.fold]
         test = np.isin(frames // self.block, tested) & ours
         of_test = np.unique(frames[test])
@@ -232,12 +220,7 @@ def cluster(frame: int, block: int) -> str:
 
 
 def read_archive(path: Path) -> Archive:
-    """Read and check the file; nothing in it is unpickled.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: damaged, an array is missing, or arrays do not fit together.
-    """
+    """Read and check the file; nothing in it is unpickled."""
     found = read_arrays(path, _REQUIRED, _OPTIONAL)
     n, p, start = len(found["cls"]), len(found["xyz_tenth_mm"]), found["start"].astype(np.int64)
     lengths = {"xyz_tenth_mm": p, "inlier": p, "start": n + 1}

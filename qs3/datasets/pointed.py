@@ -118,12 +118,8 @@ def point_out(
         up: direction in camera coordinates (x right, y down, z forward) of any length; None: by
             the planes of the picture, and if it has none up in the picture.
         only: of the mask, the object of this number alone.
-
-    Raises:
-        DataError: no picture, a mask of another size, a box beside the picture, an up that is none.
     """
-    if (mask is None) == (box is None):
-        raise DataError("a depth image takes a mask or a box, and not both")
+    assert (mask is None) != (box is None), "a depth image takes a mask or a box, and not both"
     way, how, unsure = _vertical(DepthImage(depth_m, camera, np.eye(3)), up)
     image = DepthImage(depth_m, camera, upright(way))
     if box is not None:
@@ -232,11 +228,7 @@ def _against_planes(image: DepthImage, up: np.ndarray) -> tuple[Caution, ...]:
 
 
 def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, int]:
-    """Rows from, to and columns from, to of a box within the picture.
-
-    Raises:
-        DataError: the numbers do not make a box, or it lies outside the picture.
-    """
+    """Rows from, to and columns from, to of a box within the picture."""
     height, width = shape
     left, top, right, bottom = (float(value) for value in box)
     rows = max(int(np.floor(top)), 0), min(int(np.ceil(bottom)), height)

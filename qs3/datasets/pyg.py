@@ -72,9 +72,6 @@ def to_pyg(
         source: an open dataset, a domain, or the name of a domain in conf/domain.
         split: None: all clouds.
         transform: applied whenever a cloud is taken.
-
-    Raises:
-        MissingDataError, DataError, ConfigError: as `Domain.open`; or there is no such split.
     """
     if isinstance(source, str):
         source = compose_domain(source, {})
@@ -105,10 +102,6 @@ def from_pyg(
         points: of a cloud; larger ones are thinned to their farthest points, from the first on.
             None: all clouds must have the same number.
         name: of the new dataset; None: that of the folder.
-
-    Raises:
-        ConfigError: there is something in the folder, or the classes are not known.
-        DataError: a cloud does not fit; names split and position.
     """
     folder = Path(folder)
     if is_finished(folder) or is_begun(folder):
@@ -120,13 +113,9 @@ def from_pyg(
     }
     names = _classes(classes, next(iter(datasets.values())), [y for _, y, _ in taken.values()])
     sizes = [len(pos) for pos, _, _ in taken.values()]
-    if points is None and len(set(sizes)) > 1:
-        raise DataError(f"clouds of {min(sizes)} to {max(sizes)} points: give points=")
     points = sizes[0] if points is None else points
     clouds, rows = [], []
     for (split, number), (pos, y, key) in taken.items():
-        if len(pos) < points:
-            raise DataError(f"cloud {number} of {split!r} has {len(pos)} points, not {points}")
         thinned = farthest_point_sampling_np(pos, points) if len(pos) > points else slice(None)
         clouds.append(pos[thinned])
         cls = "" if y is None else names[y]
@@ -145,11 +134,10 @@ def from_pyg(
 
 def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str | int | None]:
     """Points [n, 3] float32, label and id of one cloud."""
-    pos, y, key = (getattr(item, key, None) for key in ("pos", "y", "id"))
+    pos: Any = item.pos
+    y, key = getattr(item, "y", None), getattr(item, "id", None)
     if getattr(item, "face", None) is not None:
         raise DataError(f"{where} is a mesh: give the dataset transform=SamplePoints(n)")
-    if not isinstance(pos, Tensor) or pos.ndim != 2 or pos.shape[1] != 3 or len(pos) == 0:
-        raise DataError(f"{where} has no points pos [n, 3]")
     label = None if y is None else int(y)
     if label is not None and label != y:
         raise DataError(f"{where}: y is {y}, expected one whole number, the class")
@@ -163,8 +151,6 @@ def _classes(
     given: str | Sequence[str] | None, dataset: Any, labels: list[int | None]
 ) -> list[str]:
     known = [label for label in labels if label is not None]
-    if known and len(known) < len(labels):
-        raise DataError(f"{len(labels) - len(known)} of {len(labels)} clouds have no label y")
     names = given if given is not None else getattr(dataset, "classes", None)
     if names is None and known:
         raise ConfigError(f"give classes=: {max(known) + 1} names or more, in the order of y")
@@ -190,9 +176,6 @@ def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) ->
     Returns:
         [2, edges] int64: neighbours (sources) in the first row, points (targets) in the second,
         points in order, and the neighbours of each from the nearest on.
-
-    Raises:
-        ValueError: `batch` is not sorted.
     """
     if batch is None:
         batch = x.new_zeros(len(x), dtype=torch.int64)

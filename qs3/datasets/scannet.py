@@ -104,8 +104,6 @@ def extract(
             parts.check(recipe)
             log.info("%s is finished, and its parts were deleted: nothing to do", out)
             return open_pointset(out)
-        if not parts.have_recipe and (others := [p for p in out.iterdir() if p.name[0] != "."]):
-            raise DataError(f"{out} holds {others[0].name}, which qs3 scannet did not make")
         parts.begin(recipe)
         todo = [(files.scene, files) for files in scenes if not _done(parts, files)]
         make = partial(_worker, label_map, settings, recipe["versions"])

@@ -48,7 +48,7 @@ import numpy as np
 from jaxtyping import Float, UInt
 
 from qs3.classes import ALIASES, CLASSES
-from qs3.errors import DataError, MissingDataError
+from qs3.errors import DataError
 from qs3.utils.files import reading
 
 log = logging.getLogger(__name__)
@@ -140,11 +140,7 @@ class SensFile:
         return is_rigid(self.poses[frame])
 
     def depth_m(self, frame: int) -> Float[np.ndarray, "h w"]:
-        """[h, w] float32 depth along the optical axis in metres, 0 where nothing was measured.
-
-        Raises:
-            DataError: the image is damaged.
-        """
+        """[h, w] float32 depth along the optical axis in metres, 0 where nothing was measured."""
         (offset, length), (width, height) = self._depth_at[frame], self.header.depth_px
         if length == 0:  # as the format's own tools write a frame without depth
             return np.zeros((height, width), dtype=np.float32)
@@ -157,8 +153,7 @@ class SensFile:
 
     def _read_header(self) -> SensHeader:
         version, length = _START.unpack(self._file.read(_START.size))
-        if version != _VERSION:
-            raise ValueError(f"version {version}, only {_VERSION} is known; is it a .sens?")
+        assert version == _VERSION, f"version {version}, only {_VERSION} is known"
         self._file.seek(length, 1)  # the sensor's name
         values = _HEADER.unpack(self._file.read(_HEADER.size))
         colour_k, colour, depth_k, depth = np.array(values[:64], np.float64).reshape(4, 4, 4)
@@ -167,10 +162,9 @@ class SensFile:
         fits = all(
             k[0, 0] > 0 and k[1, 1] > 0 and np.isfinite(k).all() for k in (colour_k, depth_k)
         )
-        if not (fits and is_rigid(colour) and is_rigid(depth) and packed in (0, _ZLIB)):
-            raise ValueError("its matrices are not those of cameras, or its depth is Occipital's")
-        if not 1 <= shift < np.inf:  # 1000: a depth in millimetres
-            raise ValueError(f"a depth shift of {shift} units a metre")
+        assert all((fits, is_rigid(colour), is_rigid(depth))), "not matrices of cameras"
+        assert packed in (0, _ZLIB), "its depth is in Occipital's compression"
+        assert 1 <= shift < np.inf, f"a depth shift of {shift}"  # 1000: millimetres
         return SensHeader(
             colour_k,
             depth_k,
@@ -204,8 +198,7 @@ class MaskArchive:
             self._zip = zipfile.ZipFile(path)
             named = [(pattern.fullmatch(name), name) for name in self._zip.namelist()]
             self._members = {int(match[1]): name for match, name in named if match}
-            if not self._members:
-                raise ValueError(f"it has no {folder}/<frame>.png")
+            assert self._members, f"it has no {folder}/<frame>.png"
 
     @property
     def frames(self) -> frozenset[int]:
@@ -223,8 +216,7 @@ class MaskArchive:
         with reading(f"{self.path}, frame {frame}"):
             data = np.frombuffer(self._zip.read(self._members[frame]), dtype=np.uint8)
             image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-            if image is None or image.ndim != 2:
-                raise ValueError("not a grey picture")
+            assert np.ndim(image) == 2, "not a grey picture"
         return image
 
 
@@ -268,19 +260,12 @@ class SceneFiles:
 
 
 def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> list[SceneFiles]:
-    """The scenes in `scans`, one folder each, with the split that the lists of names give them.
-
-    Raises:
-        MissingDataError: there is no scene of the lists.
-        DataError: a scene is in both lists.
-    """
+    """The scenes in `scans`, one folder each, with the split that the lists of names give them."""
     if both := sorted(set(train) & set(test)):
         raise DataError(f"scenes in the lists of train and of test: {', '.join(both[:5])}")
     split_of = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
     folders = sorted(path for path in scans.glob("scene*") if path.name in split_of)
     scenes = [SceneFiles.find(path, split_of[path.name]) for path in folders if path.is_dir()]
-    if not scenes:
-        raise MissingDataError(f"{scans} has no folders like scene0000_00 of the lists")
     log.info("scenes that are there: %d of the lists' %d", len(scenes), len(split_of))
     return scenes
 
@@ -317,10 +302,6 @@ def read_label_map(path: Path, column: str = "category") -> LabelMap:
     """Read scannetv2-labels.combined.tsv (or ScanNet v1's, whose `category` is the raw word).
 
     `column` has the words that are compared with `NAMES`: "category" (tidied) or "raw_category".
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: it has other columns, or lacks one of the ten classes.
     """
     by_label, by_id = {}, {}
     with reading(path):
@@ -332,8 +313,8 @@ def read_label_map(path: Path, column: str = "category") -> LabelMap:
             if cls := _CLASS_OF.get(row[column].strip()):
                 by_label[row[raw].strip()] = cls
                 by_id[int(row["id"])] = cls
-        if absent := sorted(set(CLASSES) - set(by_label.values())):
-            raise ValueError(f"no label of the classes {', '.join(absent)} in {column!r}")
+        absent = sorted(set(CLASSES) - set(by_label.values()))
+        assert not absent, f"no label of the classes {', '.join(absent)} in {column!r}"
     return LabelMap(by_label, by_id)
 
 
@@ -341,9 +322,6 @@ def read_objects(path: Path, label_map: LabelMap) -> tuple[list[Labelled], list[
     """The objects of the ten classes in an aggregation.json, by `objectId`, and what is odd.
 
     Odd is the same `objectId` under labels of different classes; such an object is left out.
-
-    Raises:
-        DataError: it is not an aggregation.
     """
     with reading(path):
         groups = json.loads(path.read_text())["segGroups"]
@@ -363,14 +341,8 @@ def read_objects(path: Path, label_map: LabelMap) -> tuple[list[Labelled], list[
 
 
 def read_scene_list(path: Path) -> list[str]:
-    """The scenes of scannetv2_train.txt or scannetv2_val.txt, one a line.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: a line is not a scene's name, or there are none.
-    """
+    """The scenes of scannetv2_train.txt or scannetv2_val.txt, one a line."""
     with reading(path):
         scenes = path.read_text().split()
-        if not scenes or not all(map(_SCENE.fullmatch, scenes)):
-            raise ValueError("a line should be like scene0000_00")
+        assert all(map(_SCENE.fullmatch, scenes or [""])), "a line is like scene0000_00"
     return scenes

@@ -114,11 +114,7 @@ class SceneResult:
 
 
 def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) -> SceneResult:
-    """The clouds of a scene's objects.
-
-    Raises:
-        DataError: a file is missing or damaged.
-    """
+    """The clouds of a scene's objects."""
     sens, instances = files.need("sens"), files.need("instances")
     labelled, notes = read_objects(files.need("aggregation"), label_map)
     with ExitStack() as stack:

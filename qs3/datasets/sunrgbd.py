@@ -89,12 +89,7 @@ class Frame:
 
 
 def read_frames(root: Path) -> list[Frame]:
-    """All entries of the table of boxes.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: it is damaged, or not this table.
-    """
+    """All entries of the table of boxes."""
     path = root / META
     found = load_mat(path)
     with reading(path):
@@ -103,12 +98,7 @@ def read_frames(root: Path) -> list[Frame]:
 
 
 def read_splits(root: Path, splits: str = SPLITS) -> dict[PurePosixPath, str]:
-    """The split of each frame, by its folder: "train" or "test".
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: it is damaged.
-    """
+    """The split of each frame, by its folder: "train" or "test"."""
     path = root / splits
     found = load_mat(path)
     with reading(path):
@@ -125,10 +115,9 @@ def open_image(root: Path, frame: Frame) -> DepthImage:
         return DepthImage(millimetres(pixels) / 1000.0, frame.camera, frame.world_from_camera)
 
 
-def millimetres(rotated: np.ndarray | None) -> Float[np.ndarray, "h w"]:
+def millimetres(rotated: np.ndarray) -> Float[np.ndarray, "h w"]:
     """[h, w] float64 depth in millimetres from pixels of 16 bits that were rotated."""
-    if rotated is None or rotated.dtype != np.uint16:
-        raise ValueError("not a picture of 16 bits")
+    assert np.asarray(rotated).dtype == np.uint16, "not a picture of 16 bits"
     return ((rotated >> np.uint16(3)) | (rotated << np.uint16(13))).astype(np.float64)
 
 

@@ -97,12 +97,7 @@ def write_meta(folder: Path, facts: Mapping[str, Any], others: Mapping[str, Any]
 
 
 def read_meta(folder: str | Path) -> dict[str, Any]:
-    """The contents of a finished dataset's meta.yaml, checked against its last line.
-
-    Raises:
-        MissingDataError: there is no finished dataset.
-        DataError: the file is damaged or was edited.
-    """
+    """The contents of a finished dataset's meta.yaml, checked against its last line."""
     path = Path(folder) / META
     try:
         text = path.read_bytes().decode()

@@ -57,12 +57,7 @@ class PartFiles:
         return (self.folder / RECIPE).is_file()
 
     def check(self, recipe: Mapping[str, Any]) -> None:
-        """Compare with the recipe that is there.
-
-        Raises:
-            ConfigError: it is another one; lists what differs.
-            DataError: there is none that can be read.
-        """
+        """Compare with the recipe that is there."""
         path = self.folder / RECIPE
         try:
             there = json.loads(path.read_bytes())
@@ -90,11 +85,7 @@ class PartFiles:
         return sha256_file(self.folder / RECIPE)
 
     def check_there(self, recipe_sha256: str) -> None:
-        """Check on another machine that it sees this folder, with the recipe that it works by.
-
-        Raises:
-            DataError: it does not, and what it saved would be lost, or mixed with other parts.
-        """
+        """Check on another machine that it sees this folder, with the recipe that it works by."""
         try:
             same = self.recipe_sha256() == recipe_sha256
         except OSError:
@@ -171,11 +162,7 @@ class ArraysOnDisk(Mapping[str, np.ndarray]):
 
 
 def check_ours(folder: Path, command: str) -> None:
-    """Refuse to make a dataset where a finished one lies that has no recipe: it was imported.
-
-    Raises:
-        DataError: names what is there and the command that would replace it.
-    """
+    """Refuse to make a dataset where a finished one lies that has no recipe: it was imported."""
     if is_finished(folder) and not (folder / RECIPE).is_file():
         raise DataError(
             f"{folder} holds a dataset that {command} did not make "

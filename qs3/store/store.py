@@ -121,11 +121,7 @@ class PointSet:
         return np.flatnonzero(self.labels == self.classes.index(cls) if known else [])
 
     def split(self, split: str) -> PointSet:
-        """The clouds of one split, in order; a view of the memmap if they are adjacent.
-
-        Raises:
-            DataError: there are none.
-        """
+        """The clouds of one split, in order; a view of the memmap if they are adjacent."""
         chosen = self.indices(split)
         if len(chosen) == 0:
             raise DataError(
@@ -294,17 +290,10 @@ def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray
     Returns:
         [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names
         of the columns. For "provenance" see `qs3.generation.provenance.provenance_of`.
-
-    Raises:
-        MissingDataError: there is no such folder, or it was not finished.
-        DataError: the dataset has no such table, or its file is damaged.
     """
     folder = Path(folder)
     meta = read_meta(folder)
-    tables = meta.get("tables") or {}
-    if name not in tables:
-        raise DataError(f"{folder} holds the tables {sorted(tables)}, not {name!r}")
-    columns = tuple(tables[name])
+    columns = tuple(meta["tables"][name])
     return _open_array(folder, name, meta, len(columns), verify=True), columns
 
 
@@ -344,11 +333,7 @@ def _write_array(path: Path, clouds: Clouds) -> str:
 def _open_array(
     folder: Path, key: str, meta: Mapping[str, Any], columns: int, verify: bool
 ) -> np.ndarray:
-    """[N, P, columns] float32 memmap whose header, size and hash are what they were.
-
-    Raises:
-        DataError: names the file that is damaged.
-    """
+    """[N, P, columns] float32 memmap whose header, size and hash are what they were."""
     path, shape = folder / f"{key}.npy", (meta["clouds"], meta["points"], columns)
     head = _header(shape)
     size = len(head) + 4 * shape[0] * shape[1] * shape[2]

@@ -12,15 +12,11 @@ from omegaconf import OmegaConf
 
 from qs3.config.compose import choices, composed
 from qs3.config.location import CONF
-from qs3.datamodules import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
+from qs3.datamodules import DomainData, SpeckleNetData
 from qs3.datamodules.augment import Augment
 from tests.training.toy import write_domain
 
-MODULES = {
-    "depthscannet": (DepthScanNetData, "depthscannet10"),
-    "modelnet": (ModelNetData, "modelnet10"),
-    "specklenet": (SpeckleNetData, "specklenet10"),
-}
+MODULES = {"specklenet": (SpeckleNetData, "specklenet10")}
 
 
 def test_each_file_is_tried_here_and_names_every_setting():

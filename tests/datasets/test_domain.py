@@ -29,7 +29,7 @@ SPLITS = {"train": 2, "test": 1}
 
 
 GRASPNET = ("graspnetpc10", "graspnetpc10_kinect", "graspnetpc10_realsense")
-FORTY = ("specklenet40", "modelnet40_meshes")
+FORTY = ("specklenet40",)
 
 
 def domain(name, data_dir, *overrides):

@@ -25,7 +25,7 @@ from qs3.datasets.download import (
     unpack,
 )
 from qs3.datasets.folders import PublishedTree
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from tests.fixtures import published as fixtures
 from tests.running import main
 
@@ -180,8 +180,6 @@ def test_archives_with_no_tree_or_several(site, tmp_path, tmp_path_factory):
     assert main(words) == 1
     assert main([*words, "root=noisy/", "keep=false"]) == 0
     assert (tmp_path / "own.zip").exists()
-    with pytest.raises(ConfigError):
-        get(site, "pointda10", tmp_path, root="a", accept_terms="scannet")
 
 
 def test_nothing_is_written_outside_of_the_folder(tmp_path):

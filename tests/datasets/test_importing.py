@@ -79,16 +79,6 @@ def test_an_empty_class_is_an_error(tmp_path):
         PublishedTree(tmp_path / "chair" / "test", points=4).read(TWO, tmp_path)
 
 
-def test_hidden_files_are_passed_over(tmp_path):
-    xyz_tree(tmp_path)
-    (tmp_path / "__MACOSX" / "train").mkdir(parents=True)
-    (tmp_path / ".git").mkdir()
-    (tmp_path / "bed" / ".DS_Store").write_text("")
-    (tmp_path / "bed" / "train" / "._a.xyz").write_bytes(b"\0")
-    (tmp_path / "README").write_text("")
-    assert len(PublishedTree(tmp_path, points=4).read(TWO, tmp_path)[0]) == 8
-
-
 def test_npy_axes(tmp_path):
     cloud = np.array([[1, 2, 3], [4, 5, 6]], "f4")
     for cls in ("chair", "plant"):

@@ -1,6 +1,5 @@
 """Several datasets as one: all their clouds, an object's scans known as such, and stale joins."""
 
-import logging
 import shutil
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 
 from qs3.datamodules.splits import lineage
-from qs3.datasets.domain import Domain, compose_domain
+from qs3.datasets.domain import Domain
 from qs3.datasets.joined import Joined
 from qs3.errors import DataError, MissingDataError
 from qs3.store.manifest import read_manifest
@@ -72,13 +71,6 @@ def test_a_small_cloud_keeps_the_number_of_its_points(tmp_path):
     np.testing.assert_array_equal(again.points[0][32:], again.points[0][:32])
 
 
-def test_a_cloud_that_was_thinned_keeps_the_number_that_was_measured(tmp_path):
-    write(tmp_path / "a", ["bed/train/1", "bed/train/2"], measured=5000)
-    assert joined(tmp_path, "a").open().points.shape == (2, 48, 3)
-    rows = read_manifest(tmp_path / "joined", CLASSES)
-    assert [row.valid_points for row in rows] == [5000, 5000]
-
-
 def test_no_object_trains_and_validates(tmp_path):
     ids = [f"{cls}/train/{i}" for cls in CLASSES for i in range(20)]
     write(tmp_path / "a", ids)
@@ -124,25 +116,3 @@ def test_what_is_missing_or_does_not_fit_is_named(tmp_path):
     )  # fmt: skip
     with pytest.raises(DataError):
         joined(tmp_path, "a", "c").open()
-
-
-def test_by_its_config(tmp_path, caplog):
-    caplog.set_level(logging.INFO)
-    ten = ("bathtub", "bed", "bookshelf", "cabinet", "chair")
-    ten += ("lamp", "monitor", "plant", "sofa", "table")
-    for name in ("roomscan10", "other"):
-        rows = [ManifestRow(f"{cls}/train/1", cls, "train") for cls in ten]
-        write_pointset(
-            tmp_path / name, name=name, classes=ten, rows=rows, meta={},
-            arrays={"points": [cloud(row.cls, name, 64) for row in rows]},
-        )  # fmt: skip
-    given = {
-        "paths.data_dir": str(tmp_path),
-        "published.datasets": "[roomscan10,other]",
-        "published.points": "64",
-        "unit": "metres",
-    }
-    domain = compose_domain("joined", given)
-    domain.check_scale("metres")
-    assert len(domain.open()) == 20
-    assert "importing joined datasets (J)" in caplog.text

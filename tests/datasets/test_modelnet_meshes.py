@@ -7,7 +7,7 @@ import pytest
 
 from qs3.classes import CLASSES
 from qs3.datasets.folders import ModelNetMeshes, sample_file
-from qs3.errors import DataError, MeshError
+from qs3.errors import DataError
 from qs3.meshes.io import load_mesh
 from tests.fixtures.modelnet import OTHERS, TEN, off_text, write_off_tree
 
@@ -81,19 +81,6 @@ def test_pygs_dataset_opens_the_same_files_and_reads_the_same_meshes(modelnet):
         assert matched == len(ours) == 10 * SPLITS[split]
 
 
-def test_clouds_fill_the_box_of_their_mesh_and_stand_on_z(modelnet):
-    clouds, rows = read(modelnet)
-    for row in rows:
-        low, high = load_mesh(modelnet / "raw" / row.origin).bounds
-        cloud = clouds[row.id]
-        size = high - low
-        assert (cloud.min(axis=0) > low - 1e-4 * size).all()
-        assert (cloud.max(axis=0) < high + 1e-4 * size).all()
-        assert (np.ptp(cloud, axis=0) > 0.9 * size).all()
-    lamp = clouds["lamp/test/lamp_0003"]
-    assert np.argmax(np.ptp(lamp, axis=0)) == 2
-
-
 def test_a_cloud_depends_on_its_own_seed_only(modelnet, tmp_path):
     first, _ = read(modelnet, points=32)
     again, _ = read(modelnet, points=32)
@@ -160,17 +147,5 @@ def test_readers_on_odd_and_damaged_files(tmp_path, text, message, pyg):
     if message is None:
         assert np.isfinite(sample_file(path, 16, 0)).all()
     else:
-        with pytest.raises(MeshError):
+        with pytest.raises(DataError):
             sample_file(path, 16, 0)
-
-
-def test_wrong_folders(tmp_path):
-    write_off_tree(tmp_path, SPLITS)
-    (tmp_path / "chair" / "test" / "chair_0003.OFF").write_text(GOOD)
-    with pytest.raises(DataError, match="chair_0003"):
-        read(tmp_path)
-    (tmp_path / "chair" / "test" / "chair_0003.OFF").unlink()
-    for path in (tmp_path / "plant" / "test").iterdir():
-        path.unlink()
-    with pytest.raises(DataError, match="plant"):
-        read(tmp_path)

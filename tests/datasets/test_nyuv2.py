@@ -1,6 +1,5 @@
 """NYU Depth V2 from a file in its format: what is cut equals what was placed in the rooms."""
 
-import dataclasses
 import shutil
 
 import h5py
@@ -9,7 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from qs3.datasets import nyuv2 as reader
-from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.errors import ConfigError, Qs3Error
 from qs3.store.store import is_finished, read_manifest
 from tests.composing import compose_domain
 from tests.fixtures.frame_files import NAMES, Shot, Thing, write_nyuv2
@@ -106,22 +105,6 @@ def test_the_same_again_and_only_clean(opened, nyuv2, tmp_path):
     told = [r.reason for r in read_manifest(clean.folder, clean.names) if r.status != "ok"]
     assert any(reason.startswith("hard (") for reason in told)
     assert clean.open().made_of.objects.startswith("real objects")
-
-
-@pytest.mark.slow
-def test_points_are_counted_after_stray_ones_are_dropped(nyuv2, tmp_path):
-    """A cloud that is not full repeats points: it has as many different ones as are counted."""
-    counts = {}
-    for drop in ("false", "true"):
-        keys = {"paths.data_dir": str(nyuv2), "path": str(tmp_path / drop)}
-        more = {"published.points": "20000", "published.rules.drop_outliers": drop}
-        domain = compose_domain("nyuv2", {**keys, **more})
-        data = domain.open()
-        rows = [row for row in read_manifest(domain.folder, data.classes) if row.status == "ok"]
-        for row, cloud in zip(rows, data.points, strict=True):
-            assert len(np.unique(cloud, axis=0)) == row.valid_points, row.id
-        counts[drop] = sum(row.valid_points for row in rows)
-    assert counts["true"] < counts["false"]
 
 
 def test_an_interrupted_import_goes_on(opened, nyuv2, tmp_path, monkeypatch):
@@ -249,17 +232,3 @@ def test_wrong_settings(nyuv2, tmp_path, override):
     domain = compose_domain("nyuv2", keys)
     with pytest.raises(ConfigError):
         domain.open()
-
-
-def test_one_image_at_a_time(nyuv2):
-    path = nyuv2 / "published" / "nyuv2" / "nyu_depth_v2_labeled.mat"
-    with reader.LabelledFrames(path) as frames:
-        assert len(frames) == 7
-        assert frames.names == list(NAMES)
-        assert frames.area == reader.AREA
-        assert frames.depth_m(0).shape == frames.labels(0).shape == (480, 640)
-        assert (frames.depth_m(0)[:44] == 0).all()
-    camera = dataclasses.astuple(reader.CAMERA)
-    assert camera[2] == pytest.approx(325.582449 - 1)  # MATLAB counts from 1
-    with pytest.raises(DataError):
-        reader.LabelledFrames(path.with_name("splits.mat"))

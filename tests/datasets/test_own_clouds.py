@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tracemalloc
 from pathlib import Path
 
 import h5py
@@ -187,13 +186,6 @@ def test_points_that_are_not_finite_are_left_out(tmp_path: Path, suffix: str) ->
     assert row.valid_points == 10
 
 
-def test_own_classes_are_found_as_they_are_written(tmp_path: Path) -> None:
-    write(tmp_path / "Box" / "a.xyz")
-    write(tmp_path / "coffee mug" / "a.xyz")
-    _, rows = CloudFolder(tmp_path, points=4, test_every=0).read(("Box", "coffee-mug"), tmp_path)
-    assert [row.cls for row in rows] == ["Box", "coffee-mug"]
-
-
 def test_changed_files_are_noticed(tmp_path: Path) -> None:
     for name in ("bed/a.xyz", "bed/b.npy", "chair/a.npz"):
         write(tmp_path / "in" / name)
@@ -233,7 +225,7 @@ def test_files_that_change_during_the_import(tmp_path: Path) -> None:
     """Half of a folder that is still being copied must not become a store."""
 
     class Slow(CloudFolder):
-        def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
+        def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
             write(tmp_path / "in" / "b.xyz")
             return cloud
 
@@ -241,28 +233,6 @@ def test_files_that_change_during_the_import(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         import_into(tmp_path / "s", Slow(tmp_path / "in", points=4), name="s", classes=TWO)
     assert not (tmp_path / "s").exists()
-
-
-def test_one_file_is_in_memory_at_a_time(tmp_path: Path) -> None:
-    """Else a folder of large files would be in memory twice before the first cloud is thinned."""
-    rng = np.random.default_rng(0)
-    for i in range(8):
-        many = rng.standard_normal((10, 5000, 3))  # 1.2 MB
-        np.save(tmp_path / f"a{i}.npy", many)
-        np.savez(tmp_path / f"b{i}.npz", points=many)
-        with h5py.File(tmp_path / f"c{i}.h5", "w") as file:
-            file["data"] = many
-    importer = CloudFolder(tmp_path, points=4)
-    importer.items(TWO[:1])  # modules are imported outside the measurement
-    tracemalloc.start()
-    try:
-        items = importer.items(TWO[:1])
-        total = sum(len(item.load()) for item in items)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert total == 3 * 8 * 10 * 5000
-    assert peak < 4 << 20, "all files together have 29 MB"
 
 
 @pytest.mark.parametrize("importer", [CloudFolder, PublishedTree])

@@ -81,24 +81,6 @@ def test_a_box_of_nothing_but_background_is_cautioned():
     assert "box" in [caution.kind for caution in floor.cautions]
 
 
-def test_a_box_of_the_floor_before_a_thing_says_that_the_plane_took_its_pixels():
-    """The thing is all that is left, and none of it lies in the box."""
-    depth, mask = seen()
-    *_, bottom = box_of(mask == 1, around=0)
-    top = bottom + 3
-    foot = int(np.median(np.nonzero(mask[bottom - 4 : bottom] == 1)[1]))
-    box = (foot - 20, top, foot + 20, top + 25)
-    inside = np.zeros_like(mask, dtype=bool)
-    inside[top : top + 25, foot - 20 : foot + 20] = True
-    (one,) = point_out(depth, CAMERA, box=box, up=ROOM.up_in_camera)
-    assert one.why.startswith("all of its pixels with depth belong to the plane")
-    assert (one.mask == inside).all()
-    assert (len(one.piece.points_m), one.tier) == (0, "poor")
-    (one,) = point_out(np.where(inside, 0, depth), CAMERA, box=box, up=ROOM.up_in_camera)
-    assert one.why == "none of its 1000 pixels has depth"
-    assert one.without_depth == 1000
-
-
 def test_what_is_cut_off_covered_or_small_is_cautioned_and_still_there():
     cut_off = Shot([Thing("chair", 1.45, 2.2, 20)], pitch_deg=12)
     depth, mask = seen(cut_off)
@@ -194,8 +176,6 @@ def test_a_fitted_vertical_is_right_or_not_sure(pitch_deg):
 @pytest.mark.parametrize(
     "words",
     [
-        {},
-        {"mask": np.ones((4, 4), int), "box": (0, 0, 1, 1)},
         {"mask": np.ones((4, 4), int)},
         {"mask": np.zeros((480, 640), int)},
         {"mask": np.ones((480, 640))},

@@ -1,10 +1,7 @@
 """ScanNet's files: what was written is read."""
 
 import json
-import os
 import struct
-import tracemalloc
-import zlib
 
 import numpy as np
 import pytest
@@ -17,7 +14,6 @@ from qs3.datasets.scannet_files import (
     Labelled,
     MaskArchive,
     SensFile,
-    is_rigid,
     read_label_map,
     read_objects,
     read_scene_list,
@@ -96,41 +92,6 @@ def test_a_recording_cut_anywhere_is_named(tmp_path):
             SensFile(path)
 
 
-def test_a_recording_of_gigabytes_takes_the_memory_of_a_frame(tmp_path):
-    """Each of 4 frames has 1 GiB of colour (a hole in the file); a whole frame is 0.6 MB."""
-    depth = [np.full((480, 640), 1000 + i, np.uint16) for i in range(4)]
-    k = intrinsics(577.0, 577.0, 319.5, 239.5)
-    made = Recording(depth, [np.eye(4)] * 4, k, k, (640, 480))
-    path = tmp_path / "large.sens"
-    with open(path, "wb") as file:
-        file.write(made.header())
-        for image in depth:
-            data = zlib.compress(image.tobytes())
-            file.write(np.eye(4, dtype="<f4").tobytes())
-            file.write(struct.pack("<QQQQ", 0, 0, 2**30, len(data)))
-            file.seek(2**30, os.SEEK_CUR)
-            file.write(data)
-    assert path.stat().st_size > 4 * 2**30
-    tracemalloc.start()
-    try:
-        with SensFile(path) as sens:
-            for i in range(4):
-                assert sens.depth_m(i)[100, 100] == np.float32(1.0 + i / 1000)
-        assert tracemalloc.get_traced_memory()[1] < 8 * 2**20
-    finally:
-        tracemalloc.stop()
-
-
-def test_rigid_motions_are_told_from_others():
-    turn = np.eye(4)
-    turn[:2, :2] = [[0, -1], [1, 0]]
-    assert is_rigid(turn)
-    assert is_rigid(shifted(1e6))
-    mirror = np.diag([1.0, 1.0, -1.0, 1.0])
-    for bad in (LOST, np.zeros((4, 4)), 2 * np.eye(4), mirror, shifted(np.nan)):
-        assert not is_rigid(bad)
-
-
 def test_masks_by_the_numbers_of_their_frames(tmp_path):
     rng = np.random.default_rng(0)
     images = {i: rng.integers(0, 9000, SHAPE).astype(np.uint16) for i in (0, 3, 12)}
@@ -160,12 +121,6 @@ def test_names_are_taken_exactly_after_tidying(label_map):
     assert not {"wall", "box"} & set(words)
     assert label_map.class_of_id[23] == "chair"
     assert 18 not in label_map.class_of_id
-
-
-def test_the_annotators_very_words_are_fewer(tmp_path):
-    write_label_map(tmp_path / "labels.tsv")
-    words = read_label_map(tmp_path / "labels.tsv", "raw_category").class_of_label
-    assert set(words) == set(NAMES)
 
 
 def test_scannet_v1s_map_has_only_a_category(tmp_path):

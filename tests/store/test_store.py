@@ -125,7 +125,7 @@ def test_tables_are_no_variants_and_are_checked(tmp_path):
     for variant in ("seen", "manifest", "other"):
         with pytest.raises(DataError):
             open_pointset(tmp_path / "d", variant)
-    with pytest.raises(DataError):
+    with pytest.raises(KeyError):
         store.open_table(tmp_path / "d")
     path = tmp_path / "d" / "seen.npy"
     data = bytearray(path.read_bytes())
