@@ -237,7 +237,7 @@ def judge(
     prior: Annotated[str, "also with classes as common: rooms or C:N,C:N; see qs3 predict"] = "",
     prior_power: Annotated[float, Ge(0), "how much of that is believed: 0 none, 1 all"] = 0.5,
     device: Annotated[str, "cpu, cuda or cuda:1"] = "cpu",
-    out: Annotated[Path | None, ".csv or .json, with all digits"] = None,
+    out: Annotated[Path | None, "a CSV file, with all digits"] = None,
 ) -> None:
     """Judge saved runs on an archive of real objects that they were not trained on.
 
@@ -260,8 +260,7 @@ def judge(
     )  # fmt: skip
     print(judging.text(verdict))
     if out:
-        as_text = judging.json_text if out.suffix.lower() == ".json" else judging.csv_text
-        write_text(out, as_text(verdict))
+        write_text(out, judging.csv_text(verdict))
         print(f"saved {out}")
 
 

@@ -7,9 +7,7 @@ run was trained with. Nothing is trained, chosen or tuned by what comes out.
 
 from __future__ import annotations
 
-import dataclasses
 import glob
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +25,6 @@ from qs3.inference.predictor import Predictor, load
 from qs3.inference.pretrained import name_of
 from qs3.report.intervals import Interval, difference, share
 from qs3.runs.metrics import read_metrics
-from qs3.utils.files import sha256_file
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import aligned
 from qs3.utils.version import VERSION, commit, in_words
@@ -58,60 +55,25 @@ class Family:
 
 
 @dataclass(frozen=True)
-class Figures:
-    """Figures of one family on one tier of objects.
-
-    Attributes:
-        family: of runs.
-        tier: "all", "clean" or "hard".
-        n, blocks: objects, and blocks of frames they come from.
-        accuracy, balanced: with their intervals; balanced over the classes that are there.
-        majority: what always naming the commonest class would reach.
-        counts: objects of each class that is there.
-        recall: of each of them, the mean over seeds.
-        alone: classes whose objects are all of one block: with them the interval of `balanced` is
-            too narrow.
-        more: accuracy and balanced accuracy less the first family's, paired object by object; None
-            for the first.
-    """
-
-    family: Family
-    tier: str
-    n: int
-    blocks: int
-    accuracy: Interval
-    balanced: Interval
-    majority: float
-    counts: Mapping[str, int]
-    recall: Mapping[str, float]
-    alone: tuple[str, ...]
-    more: tuple[Interval, Interval] | None = None
-
-
-@dataclass(frozen=True)
 class Verdict:
-    """All of it.
+    """What was judged, and the figures of it.
 
     Attributes:
-        data, sha256: the archive.
-        part: of its `dev` that was judged on; "" for all.
+        about: the archive, its part, and what was left out, in words.
         classes: that were judged.
-        left_out: objects of other classes.
-        inliers_only: whether stray points were left out.
-        floor: z of the floor, for nets that know heights; None: as in the target of each.
-        figures: by family and tier.
-        judged_by: version of qs3, and the commit of a checkout.
+        figures: a row a family and tier ("all", "clean" or "hard"), shares in [0, 1]:
+            run, seeds, tier, objects, blocks (of frames they come from);
+            accuracy, balanced (over the classes that are there), accuracy_more and balanced_more
+            (less the first family's, paired object by object), each with _sem, _low and _high;
+            majority (what always naming the commonest class would reach);
+            recall_CLASS, objects_CLASS;
+            alone (classes whose objects are all of one block: with them the interval of the
+            balanced accuracy is too narrow); data, trained_by, judged_by.
     """
 
-    data: Path
-    sha256: str
-    part: str
+    about: str
     classes: tuple[str, ...]
-    left_out: int
-    inliers_only: bool
-    floor: float | None
-    figures: tuple[Figures, ...]
-    judged_by: str
+    figures: pd.DataFrame
 
 
 def judge(
@@ -134,15 +96,11 @@ def judge(
         classes: only objects of these; none: of all that every run knows.
         part: of its `dev`; none: "judge", where it has one, else all.
         inliers_only: leave points out that the archive marks as stray.
-        floor: z of the floor in the archive, minus its camera's height, for nets that know heights;
-            None: as in the target of each.
+        floor: z of the floor in the archive, minus its camera's height, for nets that know heights.
         device: of the nets.
-        prior, prior_power: how common classes are in the archive's place, and how much of that is
-            believed (`qs3.evaluation.prior`): each family is judged without it and with it.
+        prior, prior_power: see `qs3.evaluation.prior`: each family is judged without and with it.
 
     Raises:
-        MissingDataError: a run or the archive is not there.
-        DataError: one is damaged.
         ConfigError: nothing is left to judge on, or runs cannot be judged so.
     """
     archive = read_archive(data)
@@ -171,28 +129,28 @@ def judge(
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
     subsets = {"all": np.ones(len(kept), dtype=bool)}
     subsets |= {tier: tiers == tier for tier in TIERS if (tiers == tier).any()}
-    figures = []
+    rows = []
     guesses = [np.stack([called[file, f.prior] for file in f.runs]) for f in families]
     for family, guess in zip(families, guesses, strict=True):
+        a, b = _paired(family, guess == truth, families[0], guesses[0] == truth)
         for tier, of in subsets.items():
-            found = _figures(family, tier, guess[:, of], truth[of], blocks[of], common)
+            row: dict[str, Any] = {
+                "run": family.name,
+                "seeds": " ".join(map(str, family.seeds)),
+                "tier": tier,
+            }
+            row |= _figures(guess[:, of], truth[of], blocks[of], common)
             if family is not families[0]:
-                a, b = _paired(family, guess == truth, families[0], guesses[0] == truth)
-                some = ((a - b)[:, of], truth[of], blocks[of])
-                more = difference(*some), difference(*some, balanced=True)
-                found = replace(found, more=more)
-            figures.append(found)
-    return Verdict(
-        data,
-        sha256_file(archive.path),
-        part,
-        common,
-        len(chosen) - len(kept),
-        inliers_only,
-        floor,
-        tuple(figures),
-        in_words(VERSION, commit()),
-    )
+                for name, balanced in (("accuracy_more", False), ("balanced_more", True)):
+                    less = (a - b)[:, of]
+                    row |= _ends(name, difference(less, truth[of], blocks[of], balanced=balanced))
+            made = {"data": family.data, "trained_by": family.trained_by}
+            rows.append({**row, **made, "judged_by": in_words(VERSION, commit())})
+    stray = "left out" if inliers_only else "kept"
+    lies = "" if floor is None else f"; the floor lies at {floor:g} m"
+    others = len(chosen) - len(kept)
+    about = f"{data}{f', part {part}' * bool(part)}: real objects; stray points {stray}{lies}; "
+    return Verdict(f"{about}{others} objects of other classes left out", common, pd.DataFrame(rows))
 
 
 def _load(file: Path, prior: str, power: float, floor: float | None, device: str) -> Predictor:
@@ -284,107 +242,78 @@ def _paired(
 
 
 def _figures(
-    family: Family,
-    tier: str,
     guesses: Int[np.ndarray, "s n"],
     truth: Int[np.ndarray, " n"],
     blocks: Int[np.ndarray, " n"],
     names: Sequence[str],
-) -> Figures:
+) -> dict[str, Any]:
+    """Columns of `Verdict.figures` for some objects."""
     right = guesses == truth
     counts = np.bincount(truth, minlength=len(names))
     there = [k for k, count in enumerate(counts) if count]
-    return Figures(
-        family,
-        tier,
-        len(truth),
-        len(np.unique(blocks)),
-        share(right, truth, blocks),
-        share(right, truth, blocks, balanced=True),
-        float(counts.max() / len(truth)),
-        {names[k]: int(counts[k]) for k in there},
-        {names[k]: float(right[:, truth == k].mean()) for k in there},
-        tuple(names[k] for k in there if len(np.unique(blocks[truth == k])) == 1),
-    )
+    return {
+        "objects": len(truth),
+        "blocks": len(np.unique(blocks)),
+        **_ends("accuracy", share(right, truth, blocks)),
+        **_ends("balanced", share(right, truth, blocks, balanced=True)),
+        "majority": float(counts.max() / len(truth)),
+        **{f"recall_{names[k]}": float(right[:, truth == k].mean()) for k in there},
+        **{f"objects_{name}": int(count) for name, count in zip(names, counts, strict=True)},
+        "alone": ", ".join(names[k] for k in there if len(np.unique(blocks[truth == k])) == 1),
+    }
 
 
-def text(v: Verdict) -> str:
+def _ends(name: str, one: Interval) -> dict[str, float]:
+    """Columns of an interval; nan for what it has not."""
+    ends = {"": one.mean, "_sem": one.sem, "_low": one.low, "_high": one.high}
+    return {f"{name}{key}": np.nan if end is None else end for key, end in ends.items()}
+
+
+def text(verdict: Verdict) -> str:
     """Tables: a row a family and tier, with differences to the first family; a row a class."""
-    base = v.figures[0].family
-    several = any(f.more for f in v.figures)
-    less = [f"accuracy less {base.name}", "balanced less its"] * several
-    head = ["run", "seeds", "tier", "objects", "blocks", "accuracy %", "balanced %", "majority %"]
-    rows = [[*head, *less]]
-    for f in v.figures:
-        shown = [_percent(f.accuracy), _percent(f.balanced), f"{100 * f.majority:.1f}"]
-        seeds = ",".join(map(str, f.family.seeds)) or "?"
-        more = [_percent(one, "+") for one in f.more or ()] or [""] * len(less)
-        rows.append([f.family.name, seeds, f.tier, str(f.n), str(f.blocks), *shown, *more])
-    part = f", part {v.part}" if v.part else ""
-    floor = "" if v.floor is None else f"; the floor lies at {v.floor:g} m"
+    figures = verdict.figures
+    first = figures.run.iloc[0]
+    shown = [n for n in ("accuracy", "balanced", "accuracy_more", "balanced_more") if n in figures]
+    more = {"accuracy_more": f"accuracy less {first}", "balanced_more": "balanced less its"}
+    head = ["run", "seeds", "tier", "objects", "blocks", "majority %"]
+    rows = [[*head, *(more.get(name, f"{name} %") for name in shown)]]
+    for _, f in figures.iterrows():
+        counts = [str(f.objects), str(f.blocks), f"{100 * f.majority:.1f}"]
+        shares = [_percent(f, name) for name in shown]
+        rows.append([f.run, f.seeds or "?", f.tier, *counts, *shares])
     lines = [
-        f"{v.data}{part}: real objects; stray points {'left out' if v.inliers_only else 'kept'}"
-        f"{floor}; {v.left_out} objects of other classes left out",
+        verdict.about,
         *aligned(rows),
         "Mean ± SEM over seeds; in brackets the interval at 95 %, with blocks of frames as clusters"
-        " and, of several runs, seeds.",
+        " and, of several runs, seeds; without ± over blocks alone.",
     ]
-    if any(f.more and f.more[0].seeds < 2 for f in v.figures):
-        lines.append("(!) fewer than two common seeds: the difference's interval is over blocks")
-    for f in v.figures:
-        if f.family is base and f.alone and f.blocks > 1:
-            lines.append(
-                f"(!) {', '.join(f.alone)} ({f.tier}) lie in one block alone: these balanced "
-                "intervals are too narrow"
-            )
-    families = dict.fromkeys(f.family for f in v.figures)
-    lines += [f"data of {family.name}: {family.data}" for family in families if family.data]
-    lines += [f"trained by, {one.name}: {one.trained_by}" for one in families if one.trained_by]
-    lines.append(f"judged by {v.judged_by}")
-    everything = [f for f in v.figures if f.tier == "all"]
-    tiers = [f for f in v.figures if f.family is base]
-    classes = [["class", *(f.tier for f in tiers), *(f.family.name for f in everything)]]
-    for name in everything[0].counts:
-        counts = [str(f.counts.get(name, 0)) for f in tiers]
-        classes.append([name, *counts, *(f"{100 * f.recall[name]:.0f}" for f in everything)])
+    mine = figures[figures.run == first]
+    for _, f in mine[(mine.alone != "") & (mine.blocks > 1)].iterrows():
+        lines.append(
+            f"(!) {f.alone} ({f.tier}) lie in one block alone: these balanced intervals are too "
+            "narrow"
+        )
+    every = figures[figures.tier == "all"]
+    for key, words in (("data", "data of"), ("trained_by", "trained by,")):
+        lines += [f"{words} {f.run}: {f[key]}" for _, f in every.iterrows() if f[key]]
+    lines.append(f"judged by {every.judged_by.iloc[0]}")
+    classes = [["class", *mine.tier, *every.run]]
+    for name in (name for name in verdict.classes if every[f"objects_{name}"].iloc[0]):
+        counts = [str(count) for count in mine[f"objects_{name}"]]
+        classes.append([name, *counts, *(f"{100 * r:.0f}" for r in every[f"recall_{name}"])])
     return "\n".join([*lines, "", "recall %", *aligned(classes, numbers=True)])
 
 
-def csv_text(v: Verdict) -> str:
-    """A row a family and tier, with a recall and a count for each class; shares in [0, 1].
-
-    At its end how much more than the first family's its accuracies are, what the data are made of,
-    and what trained and judged.
-    """
-    rows = []
-    for f in v.figures:
-        row: dict[str, Any] = {
-            "run": f.family.name,
-            "seeds": " ".join(map(str, f.family.seeds)),
-            "tier": f.tier,
-        }
-        row |= {"objects": f.n, "blocks": f.blocks, "majority": f.majority}
-        accuracies = {"accuracy": f.accuracy, "balanced": f.balanced}
-        if f.more:
-            accuracies |= {"accuracy_more": f.more[0], "balanced_more": f.more[1]}
-        for name, one in accuracies.items():
-            ends = {"": one.mean, "_sem": one.sem, "_low": one.low, "_high": one.high}
-            row |= {f"{name}{key}": value for key, value in ends.items()}
-        row |= {f"recall_{name}": f.recall.get(name) for name in v.classes}
-        row |= {f"objects_{name}": f.counts.get(name, 0) for name in v.classes}
-        made = {"data": f.family.data, "trained_by": f.family.trained_by}
-        rows.append({**row, **made, "judged_by": v.judged_by})
-    return pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+def csv_text(verdict: Verdict) -> str:
+    """`Verdict.figures` with all digits."""
+    return str(verdict.figures.to_csv(index=False, lineterminator="\n"))
 
 
-def json_text(v: Verdict) -> str:
-    """Everything, paths as text."""
-    values = dataclasses.asdict(v)
-    return json.dumps(values, indent=1, allow_nan=False, ensure_ascii=False, default=str) + "\n"
-
-
-def _percent(one: Interval, sign: str = "") -> str:
-    """Such as "64.0 ± 1.0 [58.1, 69.9]"."""
-    mean, space, ends = one.percent(sign).partition(" ")
-    sem = "" if one.sem is None else f" ± {100 * one.sem:.1f}"
-    return f"{mean}{sem}{space}{ends}"
+def _percent(figures: pd.Series, name: str) -> str:
+    """Such as "64.0 ± 1.0 [58.1, 69.9]"; "" if it is not known."""
+    sign = "+" if name.endswith("_more") else ""
+    mean, sem, low, high = (100 * figures[f"{name}{e}"] for e in ("", "_sem", "_low", "_high"))
+    if np.isnan(mean):
+        return ""
+    ends = "" if np.isnan(low) else f" [{low:{sign}.1f}, {high:{sign}.1f}]"
+    return f"{mean:{sign}.1f}{'' if np.isnan(sem) else f' ± {sem:.1f}'}{ends}"

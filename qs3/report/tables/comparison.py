@@ -151,7 +151,7 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
 def _difference(name: str, pairs: Sequence[tuple[Cell, Cell]], simulated: bool) -> Compared:
     """The rows are taken as given: the interval is over seeds and clusters, as for one pair."""
     cells = [cell for pair in pairs for cell in pair]
-    if any(cell.take != "final" for cell in cells):
+    if any(cell.entry.take != "final" for cell in cells):
         raise DataError("a warm-up's predictions are not kept")
     if lacking := [cell for cell in cells if not cell.finished]:
         raise DataError("; ".join(f"{cell.row}, {cell.column}: not run" for cell in lacking))

@@ -42,19 +42,18 @@ def _plain_grid(table: Table) -> list[list[str]]:
             continue
         of_paper = "paper" if _ACCURACY in table.metrics else f"paper, {METRICS[_ACCURACY]}"
         header += _heads(table, i, many) + [of_paper] * _has_paper(table, i)
-    lines = [[*header, *["core time a run", "memory"] * table.costs, *["seeds"] * (not many)]]
+    lines = [[*header, *["seeds"] * (not many)]]
     for name, cells in table.rows.items():
         line = [name]
         for i, cell in enumerate(cells):
-            paper = cell.paper if cell else None
+            paper = cell.paper if cell else ""
             if not table.ours(i):
-                line.append(f"{paper} ({paper.selected})" if paper else "")
+                line.append(f"{paper} ({cell.entry.selected})" if cell and paper else "")
                 continue
-            line += _ours(table, cell) + [str(paper or "")] * _has_paper(table, i)
-        finished = [cell.runs.finished for cell in cells if cell and cell.runs]
-        runs = pd.concat(finished) if finished else pd.DataFrame(columns=[*COSTS, "seed"])
-        line += [_time(runs.core_seconds), _memory(runs)] if table.costs else []
-        line += [] if many else [", ".join(map(str, runs.seed)) or "-"]
+            line += _ours(table, cell) + [paper] * _has_paper(table, i)
+        if not many:
+            seeds = cells[0].runs.seeds if cells[0] and cells[0].runs else []
+            line.append(", ".join(map(str, seeds)) or "-")
         lines.append(line)
     return lines
 
@@ -78,12 +77,13 @@ def _benchmark_grid(table: Table) -> list[list[str]]:
     header += [f"average {METRICS[m]}" for m in table.metrics]
     lines = [[*header, "epoch selected by"]]
     for name, cells in table.rows.items():
-        papers = [cell.paper if cell else None for cell in cells]
+        papers = [cell.paper if cell else "" for cell in cells]
         if any(papers) and _ACCURACY in table.metrics:
             line = [name, "published"]
             for paper in [*papers, table.published_average(name)]:
-                line += [str(paper or "") if m == _ACCURACY else "" for m in table.metrics]
-            lines.append([*line, " or ".join(dict.fromkeys(p.selected for p in papers if p))])
+                line += [paper if m == _ACCURACY else "" for m in table.metrics]
+            rules = _unique(c.entry.selected for c in cells if c and c.paper)
+            lines.append([*line, " or ".join(rules)])
         if any(cell and cell.runnable for cell in cells):
             line = [name, "ours", *(text for cell in cells for text in _ours(table, cell))]
             other = any(_is_other(table, cell) for cell in cells)
@@ -123,25 +123,6 @@ def _has_paper(table: Table, column: int) -> bool:
     return any((cell := row[column]) and cell.paper for row in table.rows.values())
 
 
-def _time(seconds: pd.Series) -> str:
-    """Seconds of runs such as "3.5 min" or "3.5 to 4.1 min"; "" of none."""
-    most = seconds.max()
-    unit, name = (3600, "h") if most >= 3600 else (60, "min") if most >= 60 else (1, "s")
-    return _span(seconds / unit, name)
-
-
-def _memory(runs: pd.DataFrame) -> str:
-    """Such as "0.8 GB" or "0.8 to 0.9 GB, GPU 2.1 GB"; "" where it is not known."""
-    gpu = _span(runs.gpu_memory_gb, "GB")
-    return _span(runs.memory_gb, "GB") + (f", GPU {gpu}" if gpu else "")
-
-
-def _span(values: pd.Series, unit: str) -> str:
-    known = values.dropna()
-    ends = dict.fromkeys(f"{value:.1f}" for value in (known.min(), known.max()) if len(known))
-    return f"{' to '.join(ends)} {unit}" if ends else ""
-
-
 def marks(table: Table) -> list[str]:
     """What must not be overlooked: simulated targets, other data or meshes, seeds that failed."""
     simulated = _unique(name for i in range(len(table.columns)) for name in table.simulated(i))
@@ -176,8 +157,8 @@ def remarks(table: Table) -> list[str]:
         counts = runs.groupby(["row", "column"]).size()
         seeds = " to ".join(dict.fromkeys(map(str, (counts.min(), counts.max()))))
         lines.append(f"mean ± standard error over {seeds} seeds; (n=...): fewer than {FEW_SEEDS}")
-    for source in _unique(cell.paper.source for cell in table.cells if cell.paper):
-        rows = _unique(c.row for c in table.cells if c.paper and c.paper.source == source)
+    for source in _unique(cell.entry.source for cell in table.cells if cell.paper):
+        rows = _unique(c.row for c in table.cells if c.paper and c.entry.source == source)
         lines.append(f"published numbers of {', '.join(rows)}: {source}")
     return _unique([*lines, *problems_of(table)])
 
@@ -249,7 +230,6 @@ def csv_text(table: Table) -> str:
 def _csv_line(cell: Cell, metric: Metric) -> dict[str, Any]:
     runs = cell.runs or Runs(pd.DataFrame(columns=["problem", "seed", *COSTS]))
     first, stat = runs.first, cell.ours(metric)
-    paper = cell.paper if metric == _ACCURACY else None
 
     def joined(name: str) -> str:
         return " ".join(f"{v:g}" for v in runs.finished[name].dropna()) if first is not None else ""
@@ -265,10 +245,9 @@ def _csv_line(cell: Cell, metric: Metric) -> dict[str, Any]:
         "sem": 100 * stat.sem if stat and stat.sem is not None else None,
         "n": stat.n if stat else 0,
         "seeds": " ".join(map(str, runs.seeds)),
-        "paper_mean": paper and paper.mean,
-        "paper_sem": paper and paper.sem,
-        "paper_selected": paper and paper.selected,
-        "paper_source": paper and paper.source,
+        "paper": cell.paper if metric == _ACCURACY else None,
+        "paper_selected": cell.entry.selected,
+        "paper_source": cell.entry.source,
         "task": None if first is None else task(first),
         "target": cell.target,
         "simulated": str(cell.simulated).lower() if cell.target else None,

@@ -35,7 +35,7 @@ from qs3.datasets.object_archive import TIERS
 from qs3.errors import ConfigError, DataError
 from qs3.runs.folder import read_code
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
-from qs3.runs.predictions import FILE, Predictions, read_predictions
+from qs3.runs.predictions import FILE, read_predictions
 from qs3.utils.files import write_bytes
 from qs3.utils.text_table import aligned
 
@@ -190,12 +190,20 @@ def read_kept(path: str | Path, target: str | None = None) -> dict[tuple[str, st
 class Answers:
     """What a run called each test cloud: columns of the frame as arrays [n]."""
 
-    clouds: str
     labels: Int[np.ndarray, " n"]
     called: Int[np.ndarray, " n"]
     clusters: Int[np.ndarray, " n"]
-    clusters_are: str
     tiers: np.ndarray
+    clouds: str
+    clusters_are: str
+
+    @property
+    def as_text(self) -> dict[str, str]:
+        """As columns of a kept file."""
+        return {
+            key: value if isinstance(value, str) else " ".join(map(str, value.tolist()))
+            for key, value in vars(self).items()
+        }
 
 
 def answers_of(run: Mapping[str, Any]) -> Answers:
@@ -204,41 +212,24 @@ def answers_of(run: Mapping[str, Any]) -> Answers:
     Raises:
         DataError: there are none, or they are damaged.
     """
-    if not run.get("called"):
-        if not run["folder"]:
-            raise DataError(f"no predictions of {run['experiment']}, seed {run['seed']}, are kept")
-        return _answers(read_predictions(Path(run["folder"]) / FILE))
-    numbers = (np.array(run[key].split(), dtype=int) for key in ("labels", "called", "clusters"))
-    labels, called, clusters = numbers
-    tiers = np.array(run["tiers"].split())
-    return Answers(run["clouds"], labels, called, clusters, run["clusters_are"], tiers)
-
-
-def _answers(said: Predictions) -> Answers:
-    digest = hashlib.sha256("\n".join((*said.classes, "", *said.ids)).encode()).hexdigest()
-    are = ROOMS if said.tiers else MESHES
-    if all(_BLOCK.fullmatch(name) for name in said.meshes):
+    if run.get("called"):
+        labels, called, clusters = (
+            np.array(run[key].split(), dtype=int) for key in ("labels", "called", "clusters")
+        )
+        tiers = np.array(run["tiers"].split())
+        return Answers(labels, called, clusters, tiers, run["clouds"], run["clusters_are"])
+    if not run["folder"]:
+        raise DataError(f"no predictions of {run['experiment']}, seed {run['seed']}, are kept")
+    found = read_predictions(Path(run["folder"]) / FILE)
+    digest = hashlib.sha256("\n".join((*found.classes, "", *found.ids)).encode()).hexdigest()
+    are = ROOMS if found.tiers else MESHES
+    if all(_BLOCK.fullmatch(name) for name in found.meshes):
         are = BLOCKS
-    elif said.meshes == said.ids:
+    elif found.meshes == found.ids:
         are = CLOUDS
-    clusters = np.unique(said.meshes, return_inverse=True)[1]
-    return Answers(
-        digest[:16], said.labels, said.predicted, clusters, are, np.array(said.tiers, dtype=str)
-    )
-
-
-def answers_as_text(run: Mapping[str, Any]) -> dict[str, str]:
-    """The columns of a kept file with a run's answers; empty if it has no predictions."""
-    try:
-        found = answers_of(run)
-    except DataError:
-        return {}
-    arrays = ("labels", "called", "clusters", "tiers")
-    return {
-        **{key: " ".join(map(str, getattr(found, key).tolist())) for key in arrays},
-        "clouds": found.clouds,
-        "clusters_are": found.clusters_are,
-    }
+    clusters = np.unique(found.meshes, return_inverse=True)[1]
+    tiers = np.array(found.tiers, dtype=str)
+    return Answers(found.labels, found.predicted, clusters, tiers, digest[:16], are)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def missing(
     if not cells:
         raise ConfigError(f"nothing of {', '.join((*rows, *columns))} can be run")
     jobs: dict[tuple[str, ...], Job] = {}
-    for cell in sorted(cells, key=lambda cell: not cell.first):
+    for cell in sorted(cells, key=lambda cell: not cell.entry.first):
         done = set(cell.runs.seeds) if cell.runs else set()
         for seed in seeds or cell.seeds:
             if seed not in done:

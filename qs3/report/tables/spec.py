@@ -57,6 +57,17 @@ class Entry:
     take: Literal["final", "warmup"] = "final"
     first: bool = False
 
+    @property
+    def mean(self) -> float | None:
+        """The published number."""
+        return self.paper[0] if isinstance(self.paper, tuple) else self.paper
+
+    @property
+    def published(self) -> str:
+        """Such as "72.4 ± 0.8"; "" if there is none."""
+        parts = self.paper if isinstance(self.paper, tuple) else (self.paper,)
+        return " ± ".join(f"{part:.1f}" for part in parts if part is not None)
+
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class _Column:
@@ -93,7 +104,6 @@ class Spec:
     Attributes:
         layout: "benchmark": published numbers on lines of their own, with how they were selected,
             and an average over the columns.
-        costs: whether time and memory stand next to the numbers.
     """
 
     title: str
@@ -103,7 +113,6 @@ class Spec:
     layout: Literal["", "benchmark"] = ""
     notes: list[str] = field(default_factory=list)
     sources: dict[str, str] = field(default_factory=dict)
-    costs: bool = False
 
     @property
     def rows_have_targets(self) -> bool:

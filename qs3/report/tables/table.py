@@ -19,12 +19,12 @@ import pandas as pd
 from qs3.config.compose import choices, composed
 from qs3.config.location import typed
 from qs3.config.quoting import override
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
 from qs3.report.tables.results import (
     FEW_SEEDS,
     Runs,
     Stat,
-    answers_as_text,
+    answers_of,
     complete,
     frame,
     load_runs,
@@ -46,59 +46,33 @@ OTHER_DATA = "‡"
 """Marks a number of ours that stands next to published ones and was not measured on their data."""
 
 
-@dataclass(frozen=True)
-class Published:
-    """A number of a paper with its SEM (None: not given), in percent.
-
-    Attributes:
-        selected: how the epoch that it belongs to was chosen.
-        source: where it was read; "": the paper that the table's title names.
-    """
-
-    mean: float
-    sem: float | None = None
-    selected: str = ""
-    source: str = ""
-
-    @staticmethod
-    def of(entry: Entry) -> Published | None:
-        """As a table's file has it."""
-        if entry.paper is None:
-            return None
-        mean, sem = entry.paper if isinstance(entry.paper, tuple) else (entry.paper, None)
-        return Published(mean, sem, entry.selected, entry.source)
-
-    def __str__(self) -> str:
-        return f"{self.mean:.1f}" + ("" if self.sem is None else f" ± {self.sem:.1f}")
-
-
 @dataclass(frozen=True, eq=False)
 class Cell:
     """One number of a table.
 
     Attributes:
         row, column: its place.
-        overrides: of train.py, without the seed; empty if there is no run of ours, only a
-            published number.
-        paper: as published, or None.
-        take: "final", or "warmup": the run's teacher before self-training.
+        entry: of the table's file.
+        overrides: of train.py, without the seed; empty if there is only a published number.
         seeds: that it should have.
-        first: its runs are started before those of other cells.
         runs: ours, finished or not; None if there are none yet.
-        target: name of the target domain; "" if the cell is not to be run.
+        target: name of the target domain; "" if it is not known.
         simulated: whether that target is simulated.
     """
 
     row: str
     column: str
+    entry: Entry
     overrides: tuple[str, ...]
-    paper: Published | None
-    take: str
     seeds: tuple[int, ...]
-    first: bool
     runs: Runs | None = None
     target: str = ""
     simulated: bool = False
+
+    @property
+    def paper(self) -> str:
+        """The published number."""
+        return self.entry.published
 
     @property
     def runnable(self) -> bool:
@@ -138,7 +112,7 @@ class Cell:
         if not self.runs.finished.labelled.any():
             return "no target labels"
         if self.runs.finished[metric].isna().all():
-            return "not of warm-ups" if self.take == "warmup" else "no such tier"
+            return "not of warm-ups" if self.entry.take == "warmup" else "no such tier"
         return f"not averaged{mark}"
 
 
@@ -148,16 +122,13 @@ class Table:
 
     Attributes:
         name: of its file.
-        title: one line.
-        notes: lines that belong below it.
+        title, notes: for above and below it.
         metrics: keys of METRICS.
         columns: names of the tasks.
         rows: cells by row name, in the order of `columns`.
-        benchmark: published numbers on lines of their own, with how they were selected, and an
-            average over the columns.
+        benchmark: see `Spec.layout`.
         averages: published averages by row, in percent, where they differ in the last digit from
             the mean of the published numbers.
-        costs: whether time and memory stand next to the numbers.
         factors: level of each factor, by row, of rows that cross several.
     """
 
@@ -169,7 +140,6 @@ class Table:
     rows: Mapping[str, tuple[Cell | None, ...]]
     benchmark: bool = False
     averages: Mapping[str, float] = field(default_factory=dict)
-    costs: bool = False
     factors: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
@@ -210,13 +180,12 @@ class Table:
         mark = f" {INCOMPLETE}" * any(cell.incomplete for cell in cells)
         return _with_n(Stat.of(by_seed.mean())) + mark
 
-    def published_average(self, row: str) -> Published | None:
+    def published_average(self, row: str) -> str:
         """As published, or the mean of the published numbers if every column has one."""
-        papers = [cell.paper for cell in self.rows[row] if cell and cell.paper]
-        if len(papers) < len(self.columns):
-            return None
-        mean = self.averages.get(row, sum(paper.mean for paper in papers) / len(papers))
-        return replace(papers[0], mean=mean, sem=None)
+        means = [cell.entry.mean for cell in self.rows[row] if cell and cell.entry.mean is not None]
+        if len(means) < len(self.columns):
+            return ""
+        return f"{self.averages.get(row, sum(means) / len(means)):.1f}"
 
 
 def _with_n(stat: Stat) -> str:
@@ -275,11 +244,9 @@ def build_table(
             cell = Cell(
                 row.name,
                 _renamed(column, target),
+                replace(entry, paper=None) if target else entry,
                 () if entry.run is None else (*shlex.split(entry.run), *own[column]),
-                None if target else Published.of(entry),
-                entry.take,
                 tuple(range(min(row.seeds, task.seeds if task else row.seeds))),
-                entry.first,
             )
             lines = known.get((cell.row, cell.column))
             if cell.runnable and runs and (lines is not None or found or not known):
@@ -296,7 +263,6 @@ def build_table(
         filled,
         bool(spec.layout),
         averages if len(shown) == len(spec.columns) else {},
-        spec.costs,
         {row.name: row.factors for row in spec.rows if row.factors},
     )
 
@@ -322,7 +288,7 @@ def _filled(
             run = _composed(_known_words(cell), place)
         cell = replace(cell, target=run.target, simulated=run.simulated)
         if runs := found.get((run.experiment, run.hash)):
-            lines = frame(runs, cell.take)
+            lines = frame(runs, cell.entry.take)
     if kept is not None:
         done = lines.seed[lines.problem == ""].tolist() if len(lines) else []
         added = kept[~kept.seed.isin(done)]
@@ -370,7 +336,13 @@ def kept_lines(table: Table) -> pd.DataFrame:
     lines = table.lines
     if lines.empty:
         raise ConfigError(f"table {table.name} has no finished runs")
-    answers = pd.DataFrame([answers_as_text(run) for run in lines.to_dict("records")])
+    found = []
+    for run in lines.to_dict("records"):
+        try:
+            found.append(answers_of(run).as_text if run["take"] == "final" else {})
+        except DataError:  # a run without predictions
+            found.append({})
+    answers = pd.DataFrame(found)
     known = lines.drop(columns=["folder", "problem", *answers.columns], errors="ignore")
     first = ["row", "column", "seed"]
     return pd.concat([known[first], known.drop(columns=first), answers.fillna("")], axis=1)

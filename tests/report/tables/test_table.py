@@ -10,7 +10,7 @@ import pytest
 from qs3.config.compose import choices
 from qs3.errors import ConfigError
 from qs3.report.tables.formats import TO_RUN, csv_text, grid, latex, markdown, to_run
-from qs3.report.tables.table import Published, build_table
+from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes, EpochScores, Evaluated, Times, Warmup
 from tests.report.made_runs import scores
 from tests.report.tables.filled import run_cell
@@ -53,19 +53,20 @@ def test_every_cell_composes_and_cells_differ(name, tmp_path):
 
 def test_the_paper_s_numbers(tmp_path):
     paper = {(c.row, c.column): c.paper for c in build_table("uda", tmp_path, runs=False).cells}
-    assert paper["PCM + QBST (from S it is QS3)", "S → D"] == Published(72.4, 0.8)
-    assert paper["DGCNN (w/o adapt)", "M → D"] == Published(46.7, 1.4)
+    assert paper["PCM + QBST (from S it is QS3)", "S → D"] == "72.4 ± 0.8"
+    assert paper["DGCNN (w/o adapt)", "M → D"] == "46.7 ± 1.4"
 
 
 def test_entries(own):
     table = own()
     real, simulated, published = table.rows["source only"]
     assert (real.target, simulated.target, simulated.simulated) == ("nyuv2", "kinectsim10", True)
-    assert simulated.paper == Published(40.0, 1.5)
+    assert simulated.paper == "40.0 ± 1.5"
     assert simulated.seeds == (0, 1, 2, 3, 4)
     assert not published.runnable
-    pcfea = table.rows["PCFEA"][2].paper
-    assert pcfea == Published(76.5, None, "target test accuracy", "read in a project page")
+    pcfea = table.rows["PCFEA"][2].entry
+    assert (pcfea.published, pcfea.selected) == ("76.5", "target test accuracy")
+    assert pcfea.source == "read in a project page"
     assert table.rows["one"][0] is None
     assert [c.column for c in own(columns=["s->k"]).rows["one"] if c] == ["S → K"]
     extra = ["report.pictures=false", "S->K:data.points=64"]
@@ -137,20 +138,15 @@ def test_paper_next_to_ours(own, tmp_path):
     real, simulated, _ = own().rows["source only"]
     times = Times(seconds=700.0, core_seconds=480.0, memory_gb=1.1, gpu_memory_gb=2.25)
     run_cell(tmp_path / "logs", real, target="nyuv2", simulated=False, times=times)
-    table = own(OWN.replace("title", "costs: true\ntitle"))
+    table = own()
     head, ours, published, _ = grid(table)
     assert head[1:3] == ["R → N, accuracy %", "paper"]
-    costs = ["8.0 min", "1.1 GB, GPU 2.2 GB"]
-    assert ours[1:] == ["51.0 ± 0.6", "50.0", "not run", "40.0 ± 1.5", "62.2 ()", *costs]
+    assert ours[1:] == ["51.0 ± 0.6", "50.0", "not run", "40.0 ± 1.5", "62.2 ()"]
     assert published[5] == "76.5 (target test accuracy)"
     assert r"51.0 $\pm$ 0.6 & 50.0 & not run & 40.0 $\pm$ 1.5" in latex(table)
     first = next(csv.DictReader(io.StringIO(csv_text(table))))
     assert float(first["mean"]) == pytest.approx(51)
-    assert (first["paper_mean"], first["seeds"], first["memory_gb"]) == (
-        "50.0",
-        "0 1 2",
-        "1.1 1.1 1.1",
-    )
+    assert (first["paper"], first["seeds"]) == ("50.0", "0 1 2")
     assert first["command"].startswith("python train.py experiment=source_only_s2d")
     run_cell(tmp_path / "logs", simulated)  # not on the published data
     table = own()
@@ -209,7 +205,7 @@ def test_another_target(own):
     text = "\n".join(["title: x", "metrics: [accuracy]", "columns: [S → D]", "rows:", *lines])
     table = own(text, target="kinectsim10")
     assert all("domain@data.target=kinectsim10" in c.overrides for c in table.cells)
-    assert all(c.paper is None for c in table.cells)
+    assert not any(c.paper for c in table.cells)
     assert "on another target: kinectsim10" in markdown(table)
     # the upper bound is trained on the other target, too
     sources = ["domain@data.source=kinectsim10" in c.overrides for c in table.cells]
