@@ -14,7 +14,6 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 from pytest_benchmark.fixture import BenchmarkFixture
-from qs3.datamodules.fps_cache import prepare
 
 import qs3
 from qs3.catalogue import Catalogue
@@ -22,8 +21,8 @@ from qs3.config.compose import composed
 from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
+from qs3.datamodules.clouds import Labelled, prepare
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
-from qs3.datamodules.splits import Labelled
 from qs3.datasets.domain import Domain
 from qs3.generation.camera_poses import AnchoredViews
 from qs3.generation.objects import mesh_items
@@ -130,14 +129,14 @@ def test_loading(
     stored = rng.normal(size=(clouds, 2048, 3)).astype(np.float32)
     np.save(tmp_path / "points.npy", stored)
     mapped = np.load(tmp_path / "points.npy", mmap_mode="r")
-    prepared = prepare(mapped, 1024, starts=4, cache_dir=tmp_path, key="benchmark")
+    ids = tuple(f"{i:05d}" for i in range(clouds))
+    kept = prepare(mapped, 1024, starts=4, cache_dir=tmp_path, key="benchmark", names=ids)
     domain = Domain("made", "M", "Made", "nowhere")
     data = AdaptationData(
         domain, domain, phases=Phases(200), scheme=SelfTrainingConfig(), augment=Augment(),
         batch_size=16, seed=0,
     )  # fmt: skip
-    ids, labels = tuple(f"{i:05d}" for i in range(clouds)), torch.arange(clouds) % 10
-    data.labelled_domain.train = Labelled(prepared, ids, labels)
+    data.labelled_domain.train = Labelled(kept, torch.arange(clouds) % 10)
     data.trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     data.trainer.training = True
 

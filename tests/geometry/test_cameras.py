@@ -8,19 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from qs3.geometry.cameras import Camera, Intrinsics, Window, look_at, project, rotation_xyz
+from qs3.geometry.cameras import Camera, Intrinsics, look_at, project, rotation_xyz
 
 coordinates = st.tuples(*[st.floats(-5, 5, allow_subnormal=False)] * 3).map(np.array)
 angles = st.tuples(*[st.floats(-4, 4, allow_subnormal=False)] * 3).map(np.array)
-
-
-def test_what_is_rendered() -> None:
-    k = Intrinsics.centred(6, 4, 2.0)
-    assert Camera(k, np.eye(4)).rendered == Window(0, 0, 6, 4)
-    window = Window(left=1, top=2, width=3, height=2)
-    assert Camera(k, np.eye(4), window).rendered == window
-    image = np.arange(24).reshape(4, 6)
-    assert image[window.slices].tolist() == [[13, 14, 15], [19, 20, 21]]
 
 
 @settings(max_examples=40, deadline=None)

@@ -2,7 +2,6 @@ import subprocess
 import sys
 from itertools import pairwise
 
-import fpsample
 import numpy as np
 import pytest
 
@@ -49,20 +48,6 @@ def test_fps_with_ties_and_copies(total: int) -> None:
         assert order[0] == start
         assert len(set(order.tolist())) == n
         assert_farthest(points, order)
-
-
-@pytest.mark.parametrize("total", [97, 1000])
-def test_buckets_start_where_we_want(total: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def never(*_: object, **__: object) -> None:
-        raise AssertionError("the start was not found in the tree")
-
-    monkeypatch.setattr(fpsample, "fps_sampling", never)
-    rng = np.random.default_rng(1)
-    for scale in (1.0, 0.01):
-        points = rng.standard_normal((total, 3)) * scale
-        points[::5] = points[0]
-        for start in rng.integers(total, size=30):
-            assert farthest_point_sampling_np(points, 40, int(start))[0] == start
 
 
 def test_fps_of_one_repeated_point_and_of_too_few() -> None:

@@ -47,17 +47,3 @@ def test_linear_has_the_plain_gradients(
         grads.append((out.detach(), a.grad, b.grad))
     for ours, theirs in zip(*grads, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("frozen", ["x", "weight"])
-def test_linear_where_one_side_is_frozen(frozen: str) -> None:
-    x, weight = torch.randn(3, 40, 7), torch.randn(5, 7)
-    learns = weight if frozen == "x" else x
-    learns.requires_grad_()
-    grads = []
-    for product in (linear, torch.nn.functional.linear):
-        learns.grad = None
-        product(x, weight).square().sum().backward()
-        assert learns.grad is not None
-        grads.append(learns.grad.clone())
-    torch.testing.assert_close(*grads, rtol=1e-4, atol=1e-4)

@@ -14,14 +14,6 @@ from tests.methods.shapes import tiny_net
 from tests.methods.test_learning import compare, gain, strays
 
 
-def test_tree_order_worked_by_hand() -> None:
-    # x: 1 and 2 before 3 and 4; then each half along y
-    points = torch.tensor([[[4.0, 1, 0], [1, 9, 0], [3, 2, 0], [2, 8, 0]]])
-    assert tree_order(points)[0, :, 0].tolist() == [2, 1, 4, 3]
-    odd = torch.tensor([[[3.0, 0, 0], [1, 5, 0], [2, 9, 0]]])  # one part, along x
-    assert tree_order(odd)[0, :, 0].tolist() == [1, 2, 3]
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 3), st.integers(1, 48), st.integers(0, 10_000))
 def test_tree_order_by_recursion(b: int, n: int, seed: int) -> None:

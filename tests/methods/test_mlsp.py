@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from qs3.methods.defrec import deform
-from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of, thinnest
+from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of
 from tests.methods.shapes import tiny_net
 
 
@@ -96,22 +96,3 @@ def test_a_head_that_knows_nothing_pays_2_ln_16() -> None:
     assert set(terms) == {"pcm", "position", "normal", "cardinality"}
     assert terms["cardinality"].item() == pytest.approx(0.05 * 2 * math.log(16), rel=1e-5)
     assert terms["normal"].item() == pytest.approx(0.5 * 2, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    "flat", [(1.0, 0.5, 0.1), (1.0, 1.0, 0.0), (1.0, 0.9, 0.8), (1e-3, 1e-3, 0)]
-)
-def test_the_thinnest_direction_is_an_eigenvector(flat: tuple[float, ...]) -> None:
-    x = torch.randn(300, 40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    x = x * torch.tensor(flat, dtype=torch.float64)
-    turn, _ = torch.linalg.qr(
-        torch.randn(300, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    )
-    scatter = (x @ turn).mT @ (x @ turn)
-    values, vectors = torch.linalg.eigh(scatter)
-    found = thinnest(scatter)
-    clear = values[:, 0] < 0.8 * values[:, 1]
-    assert clear.float().mean() > 0.2
-    agree = (found * vectors[:, :, 0]).sum(dim=1).abs()
-    assert agree[clear].min() > 0.999
-    assert torch.allclose(found.norm(dim=1), torch.ones(300).double())

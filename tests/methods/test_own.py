@@ -15,12 +15,11 @@ from torch.nn import functional as F
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hashing import config_hash
 from qs3.datamodules.augment import rotate_z
-from qs3.errors import ConfigError, MissingDataError, Qs3Error
+from qs3.errors import ConfigError, MissingDataError
 from qs3.methods.base import Method, total_loss
 from qs3.methods.bounds import SourceOnly
-from qs3.methods.own import own, random_batch, try_step
+from qs3.methods.own import own, try_step
 from tests.composing import compose
-from tests.methods.cases import CASES, batch_of
 from tests.methods.shapes import CLASSES, tiny_net
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "leaderboard.md"
@@ -112,17 +111,6 @@ def test_a_run_is_named_by_the_content_not_by_the_place(tmp_path: Path) -> None:
     )
 
 
-def test_a_run_keeps_its_name_while_the_file_is_edited(tmp_path: Path) -> None:
-    file = tmp_path / "method.py"
-    file.write_text(METHOD.format(name="A"))
-    cfg = compose("train", ["method=own", f"method.file={file}"])
-    before = config_hash(cfg)
-    file.write_text(METHOD.format(name="B"))
-    assert config_hash(cfg) == before
-    with pytest.raises(Qs3Error):
-        own(**{key: cfg.method[key] for key in ("file", "sha256")})
-
-
 def test_a_step_on_random_clouds_draws_nothing(tmp_path: Path) -> None:
     torch.manual_seed(3)
     expected = torch.rand(1)
@@ -138,18 +126,6 @@ def test_a_loss_that_needs_its_epoch_is_left_alone(tmp_path: Path) -> None:
     try_step(of(tmp_path, loss + epoch), tiny_net(), CLASSES, 16)
     with pytest.raises(AttributeError, match="pool"):
         try_step(of(tmp_path, loss), tiny_net(), CLASSES, 16)
-
-
-@pytest.mark.parametrize("name", ["source_only", "dann", "twin"])
-def test_a_batch_is_as_a_run_s(name: str) -> None:
-    """The same keys and shapes as of the batches that all methods are tested with."""
-    method = CASES[name].make()
-
-    def shapes(batch: dict[str, Any]) -> dict[str, Any]:
-        parts = {key: part for key, part in batch.items() if isinstance(part, dict)}
-        return {key: {k: x.shape for k, x in part.items()} for key, part in parts.items()}
-
-    assert shapes(random_batch(method, 3, 16)) == shapes(batch_of(CASES[name], method, 4, 16, 3))
 
 
 def test_the_total_is_the_sum_of_scalars() -> None:

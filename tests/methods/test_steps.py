@@ -7,21 +7,19 @@ does is tested in `tests/models/test_device.py`.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from qs3.methods.base import Method
-from qs3.methods.bounds import SourceOnly
 from qs3.models.dgcnn import dgcnn
 from qs3.models.pointdan import pointdan
 from tests.device import Watch
-from tests.methods.cases import CASES, Case, batch_of, total
+from tests.methods.cases import CASES, batch_of, total
 from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -113,38 +111,6 @@ def test_as_many_passes_as_stated(name: str) -> None:
     setattr(backbone, real, counted)
     total(method, net, batch, torch.Generator().manual_seed(0))
     assert calls == CASES[name].passes
-
-
-FAULTS: dict[str, Callable[[Tensor], Tensor]] = {
-    "item": lambda x: x * (1 + 0 * x.detach().sum().item()),
-    "mask": lambda x: x[x[:, 0] > -1e9],
-    "assigned by a mask": lambda x: x.index_put((x[:, 0] > -1e9,), x),
-    "cpu": lambda x: x + x.detach().cpu().to(x.device),
-    "constant": lambda x: x + torch.tensor([0.0] * CLASSES, device=x.device),
-    "loop": lambda x: torch.stack([row * 1.0 for row in x]),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_the_watch_sees_a_fault(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Faulty(nn.Module):
-        def __init__(self, net: nn.Module) -> None:
-            super().__init__()
-            self.net = net
-
-        def forward(self, points: Tensor) -> Tensor:
-            return FAULTS[fault](self.net(points))
-
-    class Wrong(SourceOnly):
-        def loss(self, net: Any, batch: Any, generator: Any) -> dict[str, Tensor]:
-            return super().loss(Faulty(net), batch, generator)
-
-    monkeypatch.setitem(CASES, fault, Case(Wrong, 1))
-    try:
-        watch = _watched(fault, b=4)
-    except (RuntimeError, NotImplementedError):
-        return
-    assert watch.carried or watch.counts != _watched(fault, b=8).counts
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

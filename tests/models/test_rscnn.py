@@ -1,29 +1,10 @@
 import pytest
 import torch
-from torch import nn
 from torch.nn import functional as F
 
 from qs3.kernels.rsconv import relations
-from qs3.models.base import PointClassifier
 from qs3.models.rscnn import group, rscnn
 from tests.models.by_formula import gradient_norm, set_weights, waves
-
-RELATIONS = ("released", "original", "paper")
-
-
-def _model(**settings: str) -> PointClassifier:
-    torch.manual_seed(0)
-    model = rscnn(4, dropout=0.0, **settings).double()
-    for name, p in model.named_parameters():  # weights of norms that are negative too
-        if p.ndim == 1:
-            nn.init.normal_(p, 1.0 if name.endswith("norm.weight") else 0.0, 0.3)
-            p.data[::3] *= -1
-    return model
-
-
-def _points(b: int = 3, n: int = 150) -> torch.Tensor:
-    x = torch.randn(b, n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return x / x.norm(dim=2).amax(1)[:, None, None]
 
 
 def _line() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -68,16 +49,6 @@ def test_relation_vector(relation: str, s: float) -> None:
     mean, covariance = out.moments()
     torch.testing.assert_close(mean, rows.mean(0))
     torch.testing.assert_close(covariance, torch.cov(rows.T, correction=0))
-
-
-@pytest.mark.parametrize("relation", RELATIONS)
-def test_order_matters_only_where_it_is_said_to(relation: str) -> None:
-    """Few points, so that all are centres and no ball is full: then only "released" sees order."""
-    model = _model(relation=relation).eval()
-    points = _points(2, 40)
-    order = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(39)])
-    a, b = model(points), model(points[:, order])
-    assert torch.allclose(a, b, rtol=1e-9, atol=1e-9) == (relation != "released")
 
 
 @pytest.mark.parametrize(
