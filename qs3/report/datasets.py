@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from qs3.catalogue import Catalogue
 from qs3.config.compose import choices
 from qs3.datasets.domain import Domain, compose_domain
-from qs3.errors import Qs3Error
+from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.folder import MeshFolder
 from qs3.meshes.mesh import Mesh
@@ -73,7 +73,7 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
     """Open a domain by the name of its config, or a store by its folder.
 
     Overrides are keys of the domain's config (`variant`, `published.folder`) or `paths.data_dir`;
-    of a folder only `variant` is read.
+    of a folder only `variant`.
 
     Raises:
         ConfigError: there is no such domain, or no such key.
@@ -84,6 +84,8 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
         domain = compose_domain(name, overrides)
         domain.tell_of_judging()
         return opened_domain(domain, domain.open())
+    if unknown := sorted({*overrides} - {"variant", "paths.data_dir"}):
+        raise ConfigError(f"{', '.join(unknown)}: a dataset's folder takes variant= alone")
     folder, variant = Path(name).expanduser(), overrides.get("variant", "points")
     data = open_pointset(folder, variant)
     more = [variant] * (variant != "points") + ["simulated"] * bool(data.meta.get("simulated"))

@@ -275,3 +275,4 @@ def test_commands(tmp_path, capsys):
     for wrong in (["nothing10"], ["modelnet10", "variantt=points"], ["/nowhere/at/all"]):
         assert main(["inspect", *wrong]) == 1
     assert main(["compare", "modelnet10"]) == 1
+    assert main(["inspect", f"{tmp_path}/kinectsim10", "path=x"]) == 1
