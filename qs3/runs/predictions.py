@@ -10,8 +10,9 @@ round_03/pseudo_labels.csv, of a round's target clouds: id, label, confidence, s
 
 from __future__ import annotations
 
+import contextlib
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -104,8 +105,8 @@ def read_predictions(path: Path) -> Predictions:
     Raises:
         DataError: it is not there, or damaged.
     """
-    header, rows = _read(path)
-    try:
+    with _named(path):
+        header, rows = _read(path)
         first = len(_FIRST) + (_TIER in header[: len(_FIRST) + 1])
         classes = tuple(name.removeprefix("p_") for name in header[first:])
         found = Predictions(
@@ -116,13 +117,10 @@ def read_predictions(path: Path) -> Predictions:
             np.array([[float(cell) for cell in row[first:]] for row in rows]),
             tuple(row[len(_FIRST)] for row in rows) if first > len(_FIRST) else (),
         )
-        if [classes.index(row[3]) for row in rows] != found.predicted.tolist():
-            raise ValueError("what is predicted is not the most probable class")
-        if len({*found.ids}) < len(rows):
-            raise ValueError("an id occurs twice")
+        called = [classes.index(row[3]) for row in rows]
+        if called != found.predicted.tolist() or len({*found.ids}) < len(rows):
+            raise ValueError("an id occurs twice, or a class is not the most probable one")
         return found
-    except (ValueError, IndexError) as error:
-        raise DataError(f"{path} is damaged ({error}); repeat the run with force=true") from error
 
 
 @dataclass(frozen=True)
@@ -160,25 +158,26 @@ def read_pseudo_labels(path: Path) -> list[PseudoLabel]:
     Raises:
         DataError: it is not there, or damaged.
     """
-    _, rows = _read(path)
-    try:
+    with _named(path):
         return [
             PseudoLabel(id_, label, float(confidence), {"0": False, "1": True}[selected])
-            for id_, label, confidence, selected in rows
+            for id_, label, confidence, selected in _read(path)[1]
         ]
-    except (ValueError, KeyError) as error:
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Turn what a damaged file raises into a DataError that names it."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, IndexError, csv.Error) as error:
         raise DataError(f"{path} is damaged ({error}); repeat the run with force=true") from error
 
 
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a CSV file, all of one length."""
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            header, first, *rows = csv.reader(file, strict=True)
-    except (OSError, ValueError, csv.Error) as error:
-        raise DataError(f"{path} cannot be read ({error}); repeat the run with force=true") from (
-            error
-        )
+    """Header and rows of a CSV file, one at least, all of one length."""
+    with open(path, newline="", encoding="utf-8") as file:
+        header, first, *rows = csv.reader(file, strict=True)
     if any(len(row) != len(header) for row in (first, *rows)):
-        raise DataError(f"{path} is damaged; repeat the run with force=true")
+        raise ValueError("rows have different lengths")
     return header, [first, *rows]

@@ -140,39 +140,56 @@ def _same(one: Cell, two: Cell) -> bool:
 
 
 def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
-    """The mean difference of pairs of cells, or why there is none."""
-    simulated = any(cell.simulated for pair in pairs for cell in pair)
-    try:
-        return _difference(name, pairs, simulated)
-    except DataError as error:
-        return Compared(name, why=str(error), simulated=simulated)
+    """The mean difference of pairs of cells, or why there is none.
 
-
-def _difference(name: str, pairs: Sequence[tuple[Cell, Cell]], simulated: bool) -> Compared:
-    """The rows are taken as given: the interval is over seeds and clusters, as for one pair."""
+    The rows are taken as given: the interval is over seeds and clusters, as for one pair.
+    """
     cells = [cell for pair in pairs for cell in pair]
+    simulated = any(cell.simulated for cell in cells)
+    try:
+        found = _why_not(cells) or _difference(cells)
+    except DataError as error:
+        found = str(error)
+    if isinstance(found, str):
+        return Compared(name, why=found, simulated=simulated)
+    return Compared(name, *found, simulated=simulated)
+
+
+def _seeds(cells: Sequence[Cell]) -> list[int]:
+    """Those that all cells have."""
+    return sorted(set.intersection(*({*cell.runs.seeds} for cell in cells if cell.runs)))
+
+
+def _why_not(cells: Sequence[Cell]) -> str:
+    """Why cells cannot be compared, as far as it is known without their predictions."""
     if any(cell.entry.take != "final" for cell in cells):
-        raise DataError("a warm-up's predictions are not kept")
+        return "a warm-up's predictions are not kept"
     if lacking := [cell for cell in cells if not cell.finished]:
-        raise DataError("; ".join(f"{cell.row}, {cell.column}: not run" for cell in lacking))
-    runs = [cell.runs for cell in cells if cell.runs]
-    seeds = sorted(set.intersection(*({*some.seeds} for some in runs)))
-    if len(seeds) < 2:
-        raise DataError(f"fewer than two seeds in common ({', '.join(map(str, seeds)) or 'none'})")
-    if not all(some.comparable for some in runs):
-        raise DataError("not averaged, see the table")
-    if all(_same(*pair) for pair in pairs):
-        raise DataError("the same runs: their settings do not differ")
-    lines = [some.finished.set_index("seed", drop=False).loc[seeds] for some in runs]
-    every = pd.concat(lines)
-    if not same_data(every, "target_data"):
-        said = (f"{r.target} {r.target_data[:12]}" for r in every.itertuples())
-        raise DataError(f"the runs saw different targets: {' and '.join(dict.fromkeys(said))}")
+        return "; ".join(f"{cell.row}, {cell.column}: not run" for cell in lacking)
+    if len(seeds := _seeds(cells)) < 2:
+        return f"fewer than two seeds in common ({', '.join(map(str, seeds)) or 'none'})"
+    if not all(cell.runs.comparable for cell in cells if cell.runs):
+        return "not averaged, see the table"
+    if all(_same(one, two) for one, two in zip(cells[::2], cells[1::2], strict=True)):
+        return "the same runs: their settings do not differ"
+    runs = pd.concat([cell.runs.finished for cell in cells if cell.runs])
+    if not same_data(runs, "target_data"):
+        seen = (f"{r.target} {r.target_data[:12]}" for r in runs.itertuples())
+        return f"the runs saw different targets: {' and '.join(dict.fromkeys(seen))}"
+    return ""
+
+
+def _difference(cells: Sequence[Cell]) -> tuple[dict[str, Pair], str, str] | str:
+    """`Compared.subsets`, `why` and `clusters`, or why there are none."""
+    seeds = _seeds(cells)
+    lines = [
+        cell.runs.finished.set_index("seed", drop=False).loc[seeds] for cell in cells if cell.runs
+    ]
     answers = [[answers_of(run) for run in some.to_dict("records")] for some in lines]
     first = answers[0][0]
     same = (first.clouds == one.clouds for row in answers for one in row)
     if not all(same) or (first.labels < 0).any():
-        raise DataError("the runs were evaluated on different clouds, or on clouds without labels")
+        return "the runs were evaluated on different clouds, or on clouds without labels"
     right = [np.stack([one.called == one.labels for one in row]).astype(float) for row in answers]
     values = np.mean([a - b for a, b in zip(right[::2], right[1::2], strict=True)], axis=0)
     tiers = {tier: first.tiers == tier for tier in TIERS if (first.tiers == tier).any()}
@@ -183,8 +200,8 @@ def _difference(name: str, pairs: Sequence[tuple[Cell, Cell]], simulated: bool) 
         if pair[0].low is not None:
             subsets[subset] = pair
     if not subsets:
-        raise DataError(f"a comparison needs test clouds of at least two {first.clusters_are}")
-    return Compared(name, subsets, "", first.clusters_are, simulated)
+        return f"a comparison needs test clouds of at least two {first.clusters_are}"
+    return subsets, "", first.clusters_are
 
 
 def text(

@@ -10,6 +10,7 @@ that cell alone.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from annotated_types import Ge, Interval, MinLen
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from qs3.config.compose import choices
@@ -137,18 +138,13 @@ def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[s
         rows = [*plain["rows"], *map(dict, more_rows)]
         plain["rows"] = [_row(row, plain) for row in rows]
         spec = TypeAdapter(Spec).validate_python(plain)
+        if twice := [name for name, n in Counter(r.name for r in spec.rows).items() if n > 1]:
+            raise ValueError(f"two rows are called {twice[0]!r}")
     except FileNotFoundError as error:
         known = ", ".join(choices("table"))
         raise ConfigError(f"there is no table {name!r}; there are {known}; or NAME.yaml") from error
-    except ValidationError as error:
-        first = max(error.errors(), key=lambda one: len(one["loc"]))
-        place = ".".join(map(str, first["loc"]))
-        raise ConfigError(f"{path}: {place}: {first['msg']}") from error
     except (yaml.YAMLError, TypeError, KeyError, ValueError, AttributeError) as error:
-        raise ConfigError(f"{path}: missing or wrong entry {error}") from error
-    names = [row.name for row in spec.rows]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ConfigError(f"{path}: two rows are called {twice[0]!r}")
+        raise ConfigError(f"{path}: missing or wrong entry: {error}") from error
     return path.stem, spec
 
 
