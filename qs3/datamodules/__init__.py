@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
-    from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
+    from qs3.datamodules.domain import DomainData
 
-__all__ = ["AdaptationData", "DepthScanNetData", "DomainData", "ModelNetData", "SpeckleNetData"]
+__all__ = ["AdaptationData", "DomainData"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,9 +1,9 @@
 """One domain as a LightningDataModule, for any LightningModule.
 
-    data = SpeckleNetData(points=256, batch_size=32)
+    data = DomainData("specklenet10", points=256, batch_size=32)
     Trainer(max_epochs=10).fit(my_module, data)
 
-or, from conf/datamodule, `hydra.utils.instantiate(cfg.datamodule)` with `+datamodule=specklenet`.
+or, from conf/datamodule, `hydra.utils.instantiate(cfg.datamodule)` with `+datamodule=domain`.
 
 A batch is `{"points": [B, N, 3] float32, "labels": [B] int64}`: clouds in the unit ball (or in
 metres, if `scale` says so), z up, sampled by farthest points. Without labels the key "labels" is
@@ -233,24 +233,3 @@ class Loader:
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for batch in self._make(self._epoch()):
             yield {**batch[self.KEY], "index": batch["index"], "epoch": batch["epoch"]}
-
-
-class SpeckleNetData(DomainData):
-    """SpeckleNet10: CAD meshes as a simulated speckle-stereo sensor sees them; see `DomainData`."""
-
-    def __init__(self, domain: Domain | str = "specklenet10", **settings: Any) -> None:
-        super().__init__(domain, **settings)
-
-
-class ModelNetData(DomainData):
-    """ModelNet10: samples of the meshes' surfaces; see `DomainData`."""
-
-    def __init__(self, domain: Domain | str = "modelnet10", **settings: Any) -> None:
-        super().__init__(domain, **settings)
-
-
-class DepthScanNetData(DomainData):
-    """DepthScanNet10: objects of ScanNet's depth images, the real target; see `DomainData`."""
-
-    def __init__(self, domain: Domain | str = "depthscannet10", **settings: Any) -> None:
-        super().__init__(domain, **settings)

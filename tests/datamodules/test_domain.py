@@ -13,7 +13,7 @@ from torch import nn
 
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.clouds import Clouds, Labelled
-from qs3.datamodules.domain import DomainData, SpeckleNetData
+from qs3.datamodules.domain import DomainData
 from qs3.datasets.domain import compose_domain
 from qs3.errors import ConfigError
 from qs3.geometry.sampling import unit_ball
@@ -91,7 +91,7 @@ def labels_of(batches: Any) -> list[int]:
 
 def test_five_lines_train_test_and_predict(data_dir, tmp_path):
     trainer = trainer_of(tmp_path)
-    data = SpeckleNetData(points=32, batch_size=8, data_dir=data_dir)
+    data = DomainData("specklenet10", points=32, batch_size=8, data_dir=data_dir)
     module = Mine()
     trainer.fit(module, data)
     assert trainer.callback_metrics["val/acc"] > 0.6
@@ -113,11 +113,11 @@ def test_epochs_are_a_function_of_seed_and_number_with_and_without_a_trainer(dat
 
     def trained(**more: Any) -> list[torch.Tensor]:
         module = Mine()
-        trainer_of(tmp_path).fit(module, SpeckleNetData(**settings, **more))
+        trainer_of(tmp_path).fit(module, DomainData("specklenet10", **settings, **more))
         return [clouds_of(b for epoch, b in module.seen if epoch == e) for e in (0, 1)]
 
     def by_hand(**more: Any) -> list[torch.Tensor]:
-        data = SpeckleNetData(**settings, **more)
+        data = DomainData("specklenet10", **settings, **more)
         data.setup("fit")
         return [clouds_of(data.train_dataloader()) for _ in range(2)]
 
@@ -136,12 +136,15 @@ def test_epochs_are_a_function_of_seed_and_number_with_and_without_a_trainer(dat
 def test_a_resumed_training_goes_on_with_the_epochs_of_an_uninterrupted_one(data_dir, tmp_path):
     settings: dict[str, Any] = {"points": 32, "batch_size": 8, "data_dir": data_dir}
     whole, begun, resumed = Mine(), Mine(), Mine()
-    trainer_of(tmp_path, 3).fit(whole, SpeckleNetData(**settings))
+    trainer_of(tmp_path, 3).fit(whole, DomainData("specklenet10", **settings))
     first = trainer_of(tmp_path, 1)
-    first.fit(begun, SpeckleNetData(**settings))
+    first.fit(begun, DomainData("specklenet10", **settings))
     first.save_checkpoint(tmp_path / "one.ckpt")
     trainer_of(tmp_path, 3).fit(
-        resumed, SpeckleNetData(**settings), ckpt_path=tmp_path / "one.ckpt", weights_only=True
+        resumed,
+        DomainData("specklenet10", **settings),
+        ckpt_path=tmp_path / "one.ckpt",
+        weights_only=True,
     )
     assert {epoch for epoch, _ in resumed.seen} == {1, 2}
     ours = [batch["points"] for _, batch in [*begun.seen, *resumed.seen]]
@@ -155,7 +158,7 @@ def test_clouds_are_augmented_while_training_and_then_alone(data_dir, tmp_path):
     plain, turned, again = Mine(), Mine(), Mine()
     own: dict[Any, Any] = {}
     for module, augment in ((plain, None), (turned, turn), (again, turn)):
-        data = SpeckleNetData(**settings, augment=augment, data_dir=data_dir)
+        data = DomainData("specklenet10", **settings, augment=augment, data_dir=data_dir)
         fitting = trainer_of(tmp_path)
         fitting.fit(module, data)
         data.setup("test")
@@ -210,7 +213,7 @@ def test_heights_are_taken_from_the_domain_s_floor(data_dir):
     ("stage", "ready"), [("fit", "train val"), ("validate", "train val"), ("test", "test predict")]
 )
 def test_a_stage_loads_what_it_needs(data_dir, stage, ready):
-    data = SpeckleNetData(points=32, data_dir=data_dir)
+    data = DomainData("specklenet10", points=32, data_dir=data_dir)
     for name in ("train", "test", "predict"):
         with pytest.raises(AssertionError, match="setup"):
             getattr(data, f"{name}_dataloader")()
