@@ -118,14 +118,7 @@ def provide(
     Nothing is fetched if all its folders are in place. An interruption at any moment leaves no
     half folder: the same call again starts over.
 
-    Args:
-        source: one of `SOURCES`.
-        into: the data folder, `paths.data_dir` of a run.
-        accept_terms: the agreement that the person has made, e.g. "scannet".
-        mirror: base address of a copy of the archives; each lies there as `Source.file`.
-        archive: an archive that is here already, e.g. downloaded with a browser.
-        root: folder in the archive to take, where it cannot be found out.
-        keep: keep the archive after unpacking; it is then not fetched again when a folder is lost.
+    For the arguments see `qs3.commands.download`.
 
     Returns:
         The folders, in the order of `source.parts`, also those that somebody else had put there.

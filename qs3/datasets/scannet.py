@@ -29,14 +29,13 @@ import numpy as np
 from qs3.classes import CLASSES
 from qs3.datasets.frames import Part, finish_parts
 from qs3.datasets.scannet_files import (
-    Labelled,
     LabelMap,
     SceneFiles,
     find_scenes,
     read_label_map,
     read_scene_list,
 )
-from qs3.datasets.scannet_scene import Extraction, ObjectCloud, SceneResult, extract_scene
+from qs3.datasets.scannet_scene import Extraction, extract_scene
 from qs3.errors import DataError, Qs3Error
 from qs3.store.manifest import ManifestRow
 from qs3.store.meta import MadeOf, is_finished, read_meta
@@ -51,7 +50,11 @@ from qs3.utils.version import VERSION
 log = logging.getLogger(__name__)
 
 SCENES = "scenes.csv"
-_PLAIN = ("frames", "frames_used", "frames_lost", "frames_unmasked", "notes")
+_COUNTS = ("frames", "frames_used", "frames_lost", "frames_unmasked")
+_FAILED: dict[str, Any] = {**dict.fromkeys(_COUNTS, 0), "objects": []}
+
+Result = tuple[SceneFiles, dict[str, Any], dict[str, np.ndarray]]
+"""A scene's files, its note and its clouds, or a note with the reason why it failed."""
 
 
 def extract(
@@ -109,9 +112,9 @@ def extract(
         make = partial(_worker, label_map, settings, recipe["versions"])
         failed = finish_parts(parts, todo, make, pool or Processes(0), "scenes", stop=False)
         results = [
-            SceneResult(files, reason=failed[files.scene])
+            (files, {**_FAILED, "reason": failed[files.scene]}, {})
             if files.scene in failed
-            else _load(parts, files)
+            else (files, *parts.read(files.scene))
             for files in scenes
         ]
         pointset = _write(out, scans, results, recipe)
@@ -128,7 +131,7 @@ def _worker(
 
     def work(files: SceneFiles) -> Part | str:
         try:
-            return _part(extract_scene(files, label_map, settings))
+            return extract_scene(files, label_map, settings)
         except Qs3Error as error:
             return str(error)
         except Exception as error:  # one odd scene must not stop a thousand
@@ -136,18 +139,6 @@ def _worker(
             return f"unexpected {type(error).__name__}: {error}"
 
     return work
-
-
-def _part(result: SceneResult) -> Part:
-    objects = result.objects
-    note = {
-        "split": result.files.split,
-        "sizes": result.files.sizes(),
-        "plain": {key: getattr(result, key) for key in _PLAIN},
-        "objects": [dataclasses.asdict(dataclasses.replace(o, cloud=None)) for o in objects],
-    }
-    clouds = {str(o.labelled.object_id): o.cloud for o in objects if o.cloud is not None}
-    return note, clouds
 
 
 def _done(parts: PartFiles, files: SceneFiles) -> bool:
@@ -158,83 +149,71 @@ def _done(parts: PartFiles, files: SceneFiles) -> bool:
     return note["split"] == files.split and note["sizes"] == files.sizes()
 
 
-def _load(parts: PartFiles, files: SceneFiles) -> SceneResult:
-    note, clouds = parts.read(files.scene)
-    objects = []
-    for one in note["objects"]:
-        labelled = Labelled(**one.pop("labelled"))
-        one |= {"frames": tuple(one["frames"]), "cloud": clouds.get(str(labelled.object_id))}
-        objects.append(ObjectCloud(labelled, **one))
-    return SceneResult(files, tuple(objects), **note["plain"])
-
-
-def _write(
-    out: Path, scans: Path, results: Sequence[SceneResult], recipe: dict[str, Any]
-) -> PointSet:
+def _write(out: Path, scans: Path, results: Sequence[Result], recipe: dict[str, Any]) -> PointSet:
     """The dataset, unless it is there already with exactly these scenes."""
     table = _scenes_csv(results, scans)
     digest = hashlib.sha256(table.encode()).hexdigest()
     if is_finished(out) and read_meta(out).get("scenes_sha256") == digest:
         log.info("nothing has changed since %s was written", out)
         return open_pointset(out)
-    objects = [(result.files, one) for result in results for one in result.objects]
+    found = [
+        (files, one, clouds.get(str(one["object_id"])))
+        for files, note, clouds in results
+        for one in note["objects"]
+    ]
     # Class by class, train before test, as the other datasets.
-    objects.sort(key=lambda pair: (CLASSES.index(pair[1].labelled.cls), pair[0].split == "test"))
-    clouds = [one.cloud for _, one in objects if one.cloud is not None]
+    found.sort(key=lambda f: (CLASSES.index(f[1]["cls"]), f[0].split == "test"))
+    clouds = [cloud for _, _, cloud in found if cloud is not None]
     if not clouds:
-        why = next((f"{r.files.scene}: {r.reason}" for r in results if r.reason), "")
-        raise DataError(f"no object of {len(results)} scenes gave a cloud; {why}")
+        why = [f"{files.scene}: {note['reason']}" for files, note, _ in results if "reason" in note]
+        raise DataError("\n  ".join([f"no object of {len(results)} scenes gave a cloud", *why[:5]]))
     write_text(out / SCENES, table)
     return write_pointset(
         out,
         name=out.name,
         classes=CLASSES,
         arrays={"points": clouds},
-        rows=[_row(files, one) for files, one in objects],
+        rows=[_row(files, one) for files, one, _ in found],
         meta={
             "simulated": False,
             **MadeOf(objects="ScanNet's raw depth, cropped by its masks here").meta,
             "scenes": len(results),
-            "scenes_failed": sum(bool(result.reason) for result in results),
+            "scenes_failed": sum("reason" in note for _, note, _ in results),
             "scenes_sha256": digest,
             **{"extraction" if key == "settings" else key: value for key, value in recipe.items()},
         },
     )
 
 
-def _row(files: SceneFiles, one: ObjectCloud) -> ManifestRow:
+def _row(files: SceneFiles, one: dict[str, Any]) -> ManifestRow:
     """The manifest's row; `origin` says scene, object, label and frames."""
-    labelled = one.labelled
-    frames = " ".join(map(str, one.frames)) or "none"
+    number, frames = one["object_id"], " ".join(map(str, one["frames"])) or "none"
     return ManifestRow(
-        id=f"{labelled.cls}/{files.split}/{files.scene}_{labelled.object_id}",
-        cls=labelled.cls,
+        id=f"{one['cls']}/{files.split}/{files.scene}_{number}",
+        cls=one["cls"],
         split=files.split,
-        origin=f"scene {files.scene}, object {labelled.object_id}, label {labelled.label!r}, "
-        f"frames {frames}, of {one.candidates}",
-        views=len(one.frames),
-        valid_points=one.fused_points,
-        status="ok" if one.cloud is not None else "skipped",
-        reason=one.reason,
+        origin=f"scene {files.scene}, object {number}, label {one['label']!r}, "
+        f"frames {frames}, of {one['candidates']}",
+        views=len(one["frames"]),
+        valid_points=one["fused_points"],
+        status="skipped" if one["reason"] else "ok",
+        reason=one["reason"],
     )
 
 
-def _scenes_csv(results: Sequence[SceneResult], scans: Path) -> str:
+def _scenes_csv(results: Sequence[Result], scans: Path) -> str:
     """One line a scene; paths in it are relative to `scans`, so it is the same anywhere."""
-    counts = ("frames", "frames_used", "frames_lost", "frames_unmasked")
     rows: list[Sequence[Any]] = [
-        ("scene", "split", "status", "objects", "clouds", *counts, "sha256", "notes")
+        ("scene", "split", "status", "objects", "clouds", *_COUNTS, "sha256", "notes")
     ]
-    for result in results:
-        digest = hashlib.sha256()
-        for one in result.objects:
-            digest.update(repr((one.labelled, one.frames, one.reason)).encode())
-            digest.update(b"" if one.cloud is None else one.cloud.tobytes())
-        notes = "; ".join(filter(None, [result.reason, *result.notes]))
-        status = "failed" if result.reason else "ok"
-        clouds = sum(one.cloud is not None for one in result.objects)
-        row = [result.files.scene, result.files.split, status, len(result.objects), clouds]
-        row += [getattr(result, key) for key in counts]
+    for files, note, clouds in results:
+        digest = hashlib.sha256(repr(note["objects"]).encode())
+        for key in sorted(clouds):
+            digest.update(clouds[key].tobytes())
+        status = "failed" if "reason" in note else "ok"
+        notes = "; ".join([note["reason"]] if "reason" in note else note["notes"])
+        row = [files.scene, files.split, status, len(note["objects"]), len(clouds)]
+        row += [note[key] for key in _COUNTS]
         rows.append([*row, digest.hexdigest()[:16], notes.replace(f"{scans}/", "")])
     return csv_text(rows)
 
@@ -249,12 +228,13 @@ def _versions() -> dict[str, str]:
     }
 
 
-def _report(pointset: PointSet, results: Sequence[SceneResult], out: Path) -> None:
+def _report(pointset: PointSet, results: Sequence[Result], out: Path) -> None:
     """Counts a class, what was left out, and the content hash."""
-    missed = (o.labelled.cls for result in results for o in result.objects if o.cloud is None)
+    missed = (one["cls"] for _, note, _ in results for one in note["objects"] if one["reason"])
     for line in counts_text(pointset, "skipped", Counter(missed)):
         log.info("%s", line)
-    log.info("frames left out for their pose: %d", sum(r.frames_lost for r in results))
-    if failed := sum(bool(result.reason) for result in results):
+    lost = sum(note["frames_lost"] for _, note, _ in results)
+    log.info("frames left out for their pose: %d", lost)
+    if failed := sum("reason" in note for _, note, _ in results):
         log.warning("%d of %d scenes failed; %s says why", failed, len(results), SCENES)
     log.info("in %s, content hash %s", out, pointset.sha256[:16])

@@ -11,17 +11,19 @@ there and not from the depth camera, gets no mask pixel: it would get the label 
 
 from __future__ import annotations
 
+import dataclasses
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 from annotated_types import Ge, Gt
 from jaxtyping import Bool, Float, Int, UInt
 
+from qs3.datasets.frames import Part
 from qs3.datasets.scannet_files import (
     INSTANCES,
     LABELS,
@@ -67,54 +69,16 @@ class Extraction:
     column: Literal["category", "raw_category"] = "category"
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectCloud:
-    """What became of one object.
+def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) -> Part:
+    """The clouds of a scene's objects.
 
-    Attributes:
-        labelled: object id, label, class.
-        frames: that were fused, ascending; empty if there is no cloud.
-        candidates: frames with enough points.
-        fused_points: before sampling.
-        cloud: [points, 3] float32 in the scene's world, metres, z up; None if there is none.
-        reason: why there is none.
+    Returns:
+        A note with numbers of frames: in the recording, looked at, left out for their pose and for
+        their mask; `notes` of what is odd; and `objects` by object id, each with its label and
+        class, the frames that were fused, how many showed enough of it, its points before sampling,
+        and `reason`, why there is no cloud. And the clouds [points, 3] float32 by object id, in the
+        scene's world, metres, z up.
     """
-
-    labelled: Labelled
-    frames: tuple[int, ...]
-    candidates: int
-    fused_points: int
-    cloud: np.ndarray | None
-    reason: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class SceneResult:
-    """What became of one scene.
-
-    Attributes:
-        files: which scene.
-        objects: those of the ten classes, by object id; empty if the scene failed.
-        frames: in the recording.
-        frames_used: looked at: with a pose and a mask.
-        frames_lost: left out because their pose is not finite or no rigid motion.
-        frames_unmasked: left out because there is no mask.
-        notes: what is odd about it.
-        reason: why the scene failed; empty if it did not.
-    """
-
-    files: SceneFiles
-    objects: tuple[ObjectCloud, ...] = ()
-    frames: int = 0
-    frames_used: int = 0
-    frames_lost: int = 0
-    frames_unmasked: int = 0
-    notes: Sequence[str] = ()
-    reason: str = ""
-
-
-def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) -> SceneResult:
-    """The clouds of a scene's objects."""
     sens, instances = files.need("sens"), files.need("instances")
     labelled, notes = read_objects(files.need("aggregation"), label_map)
     with ExitStack() as stack:
@@ -134,11 +98,23 @@ def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) 
         sightings = _first_pass(scan, frames, labelled)
         chosen = {one: sightings[one].viewpoints(settings.views) for one in labelled}
         crops, denied = _second_pass(scan, chosen, label_map)
-    objects = tuple(
-        _finish(one, sightings[one], crops[one], denied[one], settings) for one in labelled
-    )
-    lost, unmasked = len(every) - len(posed), len(posed) - len(frames)
-    return SceneResult(files, objects, len(scan.sens), len(frames), lost, unmasked, notes)
+    objects, clouds = [], {}
+    for one in labelled:
+        made, cloud = _finish(one, sightings[one], crops[one], denied[one], settings)
+        objects.append(made)
+        if cloud is not None:
+            clouds[str(one.object_id)] = cloud
+    note = {
+        "split": files.split,
+        "sizes": files.sizes(),
+        "frames": len(scan.sens),
+        "frames_used": len(frames),
+        "frames_lost": len(every) - len(posed),
+        "frames_unmasked": len(posed) - len(frames),
+        "notes": notes,
+        "objects": objects,
+    }
+    return note, clouds
 
 
 class Registration:
@@ -380,17 +356,24 @@ def _finish(
     crops: Mapping[int, np.ndarray],
     denied: int,
     settings: Extraction,
-) -> ObjectCloud:
-    """The object's cloud from its crops, or why there is none."""
-    nothing = ObjectCloud(one, (), len(sightings.frames), 0, None)
+) -> tuple[dict[str, Any], np.ndarray | None]:
+    """The object's note and its cloud from its crops; None with a reason if there is none."""
+    fused = np.concatenate([np.empty((0, 3), np.float32), *(crops[f] for f in sorted(crops))])
+    note = {
+        **dataclasses.asdict(one),
+        "frames": sorted(crops),
+        "candidates": len(sightings.frames),
+        "fused_points": len(fused),
+        "reason": "",
+    }
     if not sightings.frames:
         most, frame = sightings.most
         why = f"no frame shows more than {settings.min_points} of its points; the most are "
-        return replace(nothing, reason=f"{why}{most}, in frame {frame}")
+        return {**note, "reason": f"{why}{most}, in frame {frame}"}, None
     if not crops:
         why = f"the label masks of its chosen frames ({denied}) give it another class"
-        return replace(nothing, reason=why)
-    fused = np.concatenate([crops[frame] for frame in sorted(crops)]).astype(np.float64)
+        return {**note, "reason": why}, None
+    points = fused.astype(np.float64)
     # Of fewer points than that the order starts over, as `farthest_point_sampling_np` says.
-    sampled = fused[farthest_point_sampling_np(fused, settings.points)].astype(np.float32)
-    return replace(nothing, frames=tuple(sorted(crops)), fused_points=len(fused), cloud=sampled)
+    chosen = farthest_point_sampling_np(points, settings.points)
+    return note, points[chosen].astype(np.float32)
