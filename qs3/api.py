@@ -94,9 +94,8 @@ def generate(*arguments: Any) -> Any:
     _check_words(arguments[of_meshes:])
     if not of_meshes:
         from qs3.generation.command import generate as made
-        from qs3.generation.materials_file import with_materials
 
-        with _as_hydra("generate", with_materials(arguments)) as cfg:
+        with _as_hydra("generate", arguments) as cfg:
             return made(cfg)
     from qs3.generation.scan import scan_meshes
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from qs3.catalogue import parts as p
-from qs3.catalogue.family import Draw, families_of
+from qs3.catalogue.furniture import Draw, families_of
 from qs3.meshes.mesh import Mesh
 
 Outline = Callable[[float, float], np.ndarray]

@@ -6,7 +6,7 @@ import numpy as np
 
 from qs3.catalogue import furniture as f
 from qs3.catalogue import parts as p
-from qs3.catalogue.family import Draw, families_of
+from qs3.catalogue.furniture import Draw, families_of
 from qs3.meshes.mesh import Mesh
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from qs3.catalogue import parts as p
 from qs3.catalogue.case import WHOLE, Case, build, families_of_cases, stacked
-from qs3.catalogue.family import Draw, families_of
+from qs3.catalogue.furniture import Draw, families_of
 from qs3.meshes.mesh import Mesh
 
 TRAIN = {

@@ -7,7 +7,7 @@ from functools import partial
 
 from qs3.catalogue import joinery as j
 from qs3.catalogue import parts as p
-from qs3.catalogue.family import Draw, Family
+from qs3.catalogue.furniture import Draw, Family
 from qs3.meshes.mesh import Mesh
 
 Range = tuple[float, float]

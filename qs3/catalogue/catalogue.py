@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge
 
-from qs3.catalogue.family import Draw, Family
+from qs3.catalogue.furniture import Draw, Family
 from qs3.classes import CLASSES
-from qs3.config.checks import check_choice, check_int
-from qs3.errors import ConfigError
-from qs3.meshes.mesh import Mesh, merge
-from qs3.meshes.source import MeshItem
+from qs3.meshes.mesh import Mesh, MeshItem, merge
+from qs3.utils.settings import settings
 
+Count = Annotated[int, Ge(0)]
 SPLITS = ("train", "test")
 
 
-@dataclass(frozen=True)
+@settings
 class Catalogue:
     """Objects made on demand, each from (seed, class, split, index) alone.
 
@@ -37,35 +35,15 @@ class Catalogue:
     """
 
     seed: int = 0
-    train: int | dict[str, int] = 20
-    test: int | dict[str, int] = 10
+    train: Count | dict[str, Count] = 20
+    test: Count | dict[str, Count] = 10
     classes: tuple[str, ...] = CLASSES
     families: Literal["split", "all"] = "split"
 
-    def __post_init__(self) -> None:
-        classes = (self.classes,) if isinstance(self.classes, str) else tuple(self.classes)
-        _check_classes("classes", classes)
-        if not classes or len(set(classes)) < len(classes):
-            raise ConfigError(f"classes must name one class or more, each once, got {classes}")
-        object.__setattr__(self, "classes", classes)
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int):
-            raise ConfigError(f"the catalogue's seed must be an integer, got {self.seed!r}")
-        check_choice("catalogue.families", self.families, ("split", "all"))
-        for split in SPLITS:
-            counts = getattr(self, split)
-            if isinstance(counts, Mapping):
-                object.__setattr__(self, split, dict(counts))
-                _check_classes(split, tuple(counts))
-            for cls in classes:
-                self.count(cls, split)
-
     def count(self, cls: str, split: str) -> int:
         """How many objects of a class a split holds."""
-        counts = getattr(self, split)
-        if isinstance(counts, Mapping) and cls not in counts:
-            raise ConfigError(f"{split} gives no count for the class {cls}: add one, 0 for none")
-        count = counts[cls] if isinstance(counts, Mapping) else counts
-        return check_int(f"catalogue.{split} of {cls}", count, 0)
+        counts = self.train if split == "train" else self.test
+        return counts if isinstance(counts, int) else counts[cls]
 
     def items(self) -> list[MeshItem]:
         """All objects, ordered by class, split (train first) and index; no mesh is made yet."""
@@ -92,7 +70,6 @@ class Catalogue:
 @cache
 def families(cls: str) -> tuple[Family, ...]:
     """The structural families of a class, of both splits."""
-    _check_classes("class", (cls,))
     found: tuple[Family, ...] = import_module(f"{__package__}.{cls}").FAMILIES
     return found
 
@@ -105,8 +82,6 @@ def make(cls: str, family: str, key: str) -> Mesh:
 def make_parts(cls: str, family: str, key: str) -> list[Mesh]:
     """The watertight parts of one object, standing on the floor (z = 0), front along -y."""
     builders = {f.name: f.build for f in families(cls)}
-    if family not in builders:
-        raise ConfigError(f"{cls} has no family {family!r}, only {', '.join(builders)}")
     parts = builders[family](Draw(f"{cls}/{family}/{key}"))
     floor = min(part.bounds[0, 2] for part in parts)
     shift = np.array([0.0, 0.0, floor])
@@ -117,9 +92,3 @@ def _shuffled(names: list[str], key: str) -> list[str]:
     """The names in an order that depends on `key`; going round it uses all equally often."""
     draw = Draw(f"order of families/{key}")
     return [name for _, name in sorted((draw.between(0, 1), name) for name in names)]
-
-
-def _check_classes(where: str, names: tuple[str, ...]) -> None:
-    unknown = [name for name in names if name not in CLASSES]
-    if unknown:
-        raise ConfigError(f"{where}: {unknown} are not among the known {', '.join(CLASSES)}")

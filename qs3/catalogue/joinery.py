@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from qs3.catalogue import parts as p
-from qs3.catalogue.family import Draw
+from qs3.catalogue.furniture import Draw
 from qs3.meshes.mesh import Mesh
 
 FRONT_M = 0.02  # thickness of doors and drawer fronts

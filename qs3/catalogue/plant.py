@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from qs3.catalogue import parts as p
-from qs3.catalogue.family import Draw, families_of
+from qs3.catalogue.furniture import Draw, families_of
 from qs3.meshes.mesh import Mesh
 
 

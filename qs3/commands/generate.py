@@ -1,13 +1,10 @@
 """CAD meshes to point clouds: `qs3-generate domain=specklenet10 meshes=PATH`."""
 
-import sys
-
 import hydra
 from omegaconf import DictConfig
 
 from qs3.config.hydra import cli_errors
 from qs3.config.location import CONF
-from qs3.errors import Qs3Error
 from qs3.utils.commands import hydra_command
 
 
@@ -21,13 +18,6 @@ def _composed(cfg: DictConfig) -> None:
 @hydra_command
 def main() -> None:
     """Make the dataset that the command line describes, or continue it."""
-    if any(word.startswith("materials=") for word in sys.argv[1:]):
-        from qs3.generation.materials_file import with_materials
-
-        try:
-            sys.argv[1:] = with_materials(sys.argv[1:])
-        except Qs3Error as error:
-            sys.exit(f"{type(error).__name__}: {error}")
     _composed()
 
 

@@ -44,6 +44,7 @@ class Piece:
         tier: "clean" or "hard".
         why: what makes it hard; or with `refused`, what is wrong.
         refused: it cannot be used.
+        own: the pixels of `points_m`; None where nothing was cut.
     """
 
     points_m: Float[np.ndarray, "n 3"]
@@ -58,6 +59,7 @@ class Piece:
     tier: str = CLEAN
     why: str = ""
     refused: bool = False
+    own: Bool[np.ndarray, "h w"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +145,13 @@ def cut_out(
     depth = image.depth_m
     own, measured, core = own_pixels(image, mask, rules, edge_px)
     points = image.points_m[own]
-    inlier, pixels = inliers(points, rules), len(points)
+    inlier, pixels, taken = inliers(points, rules), len(points), own
     if rules.drop_outliers:
+        taken = own.copy()
+        taken[own] = inlier
         points, inlier = points[inlier], inlier[inlier]
     holes = 1 - float(measured.sum()) / max(int(core.sum()), 1)
-    piece = Piece(points.astype(np.float32), inlier, pixels, holes)
+    piece = Piece(points.astype(np.float32), inlier, pixels, holes, own=taken)
     if pixels == 0:
         return piece
     extent = np.ptp(points[inlier], axis=0)

@@ -8,16 +8,18 @@ top and of that what no thing stands on, of a lamp among books the shade.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 from jaxtyping import Float
 
-from qs3.config.checks import check_float, check_int, check_ranges
-from qs3.errors import ConfigError
 from qs3.generation.scenes import HAIR_M, prism, rectangle, table
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.mesh import Mesh, merge
+from qs3.meshes.placement import Positive, Share
+from qs3.utils.settings import settings
 
 _CHAIR_M = (0.38, 0.55)
 _SEAT_M = (0.42, 0.5)
@@ -29,7 +31,7 @@ _FLAT_M = 0.03
 """Under a thing the surface differs by no more than this: a board or a mattress, no pillows."""
 
 
-@dataclass(frozen=True)
+@settings
 class Arrangement:
     """What stands at an object and on it, drawn anew for each picture.
 
@@ -52,41 +54,20 @@ class Arrangement:
         min_albedo, max_albedo: of each, as of the room's.
     """
 
-    tables: Mapping[str, float] = field(default_factory=dict)
-    seats: Mapping[str, int] = field(default_factory=dict)
-    min_top_m: float = 0.7
-    max_top_m: float = 0.78
-    min_side_m: float = 0.7
-    max_side_m: float = 1.6
-    board_m: float = 0.06
-    leg_m: float = 0.05
-    apart_m: float = 0.3
-    things: Mapping[str, int] = field(default_factory=dict)
-    min_thing_m: float = 0.06
-    max_thing_m: float = 0.4
-    min_albedo: float = 0.25
-    max_albedo: float = 0.9
-
-    def __post_init__(self) -> None:
-        positive = dict.fromkeys(("board_m", "leg_m"), "> 0")
-        check_ranges(self, "recipe.arrangement.", apart_m=">= 0", **positive)
-        for cls, chance in self.tables.items():
-            check_float(f"recipe.arrangement.tables.{cls}", chance, "[0, 1]")
-        for name in ("things", "seats"):
-            for cls, most in getattr(self, name).items():
-                check_int(f"recipe.arrangement.{name}.{cls}", most, 0)
-        for name in ("top_m", "side_m", "thing_m"):
-            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
-            if not 0 < low <= high:
-                raise ConfigError(
-                    f"recipe.arrangement: 0 < min_{name} <= max_{name} must hold, got {low} and "
-                    f"{high}"
-                )
-        if not (self.board_m < self.min_top_m and 4 * self.leg_m < self.min_side_m):
-            raise ConfigError(
-                f"recipe.arrangement: no table has board_m={self.board_m} and leg_m={self.leg_m} "
-                f"with min_top_m={self.min_top_m} and min_side_m={self.min_side_m}"
-            )
+    tables: Mapping[str, Share] = field(default_factory=dict)
+    seats: Mapping[str, Annotated[int, Ge(0)]] = field(default_factory=dict)
+    min_top_m: Positive = 0.7
+    max_top_m: Positive = 0.78
+    min_side_m: Positive = 0.7
+    max_side_m: Positive = 1.6
+    board_m: Positive = 0.06
+    leg_m: Positive = 0.05
+    apart_m: Annotated[float, Ge(0)] = 0.3
+    things: Mapping[str, Annotated[int, Ge(0)]] = field(default_factory=dict)
+    min_thing_m: Positive = 0.06
+    max_thing_m: Positive = 0.4
+    min_albedo: Share = 0.25
+    max_albedo: Share = 0.9
 
     def around(
         self, mesh: Mesh, cls: str, rng: np.random.Generator, support: Mesh | None = None

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
+from annotated_types import Ge, Gt
 
-from qs3.config.checks import check_order, check_ranges
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import look_at, rotation_xyz
+from qs3.utils.settings import settings
+
+Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
+Count = Annotated[int, Ge(1)]
 
 
+@runtime_checkable
 class Views(Protocol):
     """Where the camera stands."""
 
@@ -27,7 +31,7 @@ class Views(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@settings
 class AnchoredViews:
     """The paper's law (section 3.1): one random pose, and variants close to it.
 
@@ -39,18 +43,13 @@ class AnchoredViews:
     half of it) and the spread does not grow with the view's index.
     """
 
-    count: int = 5
-    min_distance_m: float = 3.0
-    max_distance_m: float = 5.0
+    count: Count = 5
+    min_distance_m: Positive = 3.0
+    max_distance_m: Positive = 5.0
     min_elevation_deg: float = 20.0
     max_elevation_deg: float = 50.0
-    max_shift_m: float = 0.1
-    max_turn_rad: float = 0.1
-
-    def __post_init__(self) -> None:
-        _check(self.count, self.min_distance_m, self.max_distance_m)
-        check_ranges(self, "recipe.views.", max_shift_m=">= 0", max_turn_rad=">= 0")
-        check_order(self, "recipe.views.", "elevation_deg")
+    max_shift_m: NotNegative = 0.1
+    max_turn_rad: NotNegative = 0.1
 
     def poses(
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
@@ -71,31 +70,26 @@ class AnchoredViews:
         return poses
 
 
-@dataclass(frozen=True)
+@settings
 class HandheldViews:
     """Someone walks along an arc around the object and holds the camera towards it.
 
     Attributes:
         count: frames.
         min_distance_m, max_distance_m: from the circle around the object's footprint, so
-            that nobody stands in a bed.
+            that the camera does not stand in a bed.
         min_arc_deg, max_arc_deg: the frames spread over an arc drawn from this range.
         aim_m: standard deviation of the point aimed at.
     """
 
-    count: int = 4
-    min_distance_m: float = 0.9
-    max_distance_m: float = 2.2
+    count: Count = 4
+    min_distance_m: Positive = 0.9
+    max_distance_m: Positive = 2.2
     min_elevation_deg: float = 15.0
     max_elevation_deg: float = 45.0
     min_arc_deg: float = 30.0
     max_arc_deg: float = 150.0
-    aim_m: float = 0.08
-
-    def __post_init__(self) -> None:
-        _check(self.count, self.min_distance_m, self.max_distance_m)
-        check_ranges(self, "recipe.views.", aim_m=">= 0")
-        check_order(self, "recipe.views.", "elevation_deg", "arc_deg")
+    aim_m: NotNegative = 0.08
 
     def poses(
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
@@ -115,7 +109,7 @@ class HandheldViews:
         return poses
 
 
-@dataclass(frozen=True)
+@settings
 class Drift:
     """Error of the tracked camera: a random walk from frame to frame, frame 0 exact.
 
@@ -124,11 +118,8 @@ class Drift:
         turn_rad: standard deviation of each step about each axis.
     """
 
-    shift_m: float = 0.0
-    turn_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "tracking.", shift_m=">= 0", turn_rad=">= 0")
+    shift_m: NotNegative = 0.0
+    turn_rad: NotNegative = 0.0
 
     def believed(self, poses: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
         """The poses that fusion uses instead of the true ones."""
@@ -147,10 +138,3 @@ def direction(azimuth_rad: float, elevation_rad: float) -> np.ndarray:
     """[3] unit vector; the azimuth is from the x axis towards y."""
     flat = np.cos(elevation_rad)
     return np.array([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation_rad)])
-
-
-def _check(count: int, nearest_m: float, farthest_m: float) -> None:
-    if count < 1:
-        raise ConfigError(f"views must be at least 1, got {count}: set views=N on the command line")
-    if not 0 < nearest_m <= farthest_m:
-        raise ConfigError(f"distances must satisfy 0 < min <= max, got {nearest_m}, {farthest_m}")

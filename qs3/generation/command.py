@@ -10,33 +10,46 @@ import io
 import logging
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.generation.checks import check, check_recipe
-from qs3.generation.code_fingerprint import code_fingerprint
-from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
-from qs3.generation.disk import check_folder, disk_errors_explained
+from qs3.generation.kept import OBJECTS, PROVENANCE, clouds_picture, infrared_picture
 from qs3.generation.made_of import made_of
-from qs3.generation.materials import DRAWN
-from qs3.generation.mesh_sizes import warn_of_sizes
-from qs3.generation.object_parts import ELSEWHERE, InParts, Parts
-from qs3.generation.objects import left_alone, mesh_folder, mesh_items, mesh_root
-from qs3.generation.plan import benchmark, describe, keep, stated_hash, stored_config
-from qs3.generation.provenance import PROVENANCE
-from qs3.generation.recipe_fingerprint import recipe_fingerprint
-from qs3.generation.travel import software
-from qs3.generation.workers import COLLIDERS, Job, Outcome, renderer_provenance, scan_all
-from qs3.meshes.source import MeshItem
+from qs3.generation.plan import Plan, code_fingerprint, planned
+from qs3.generation.recipes import Cloud
+from qs3.generation.workers import (
+    COLLIDERS,
+    Job,
+    Outcome,
+    has_part,
+    load_part,
+    renderer_provenance,
+    save_part,
+    scan_all,
+    software,
+)
+from qs3.meshes.mesh import MeshItem
+from qs3.meshes.placement import RealSize
 from qs3.store.manifest import MANIFEST
-from qs3.store.parts import CLOUDS, CONFIG, COSTS, INFRARED, check_ours, delete_dataset
+from qs3.store.parts import (
+    CLOUDS,
+    CONFIG,
+    COSTS,
+    INFRARED,
+    PARTS,
+    PartFiles,
+    check_ours,
+    delete_dataset,
+)
 from qs3.store.store import (
     ManifestRow,
     PointSet,
@@ -47,14 +60,14 @@ from qs3.store.store import (
 )
 from qs3.utils.files import write_text
 from qs3.utils.locks import owned
-from qs3.utils.plural import counted
 from qs3.utils.pool import Pool
 from qs3.utils.progress import progress_bar
 
 log = logging.getLogger(__name__)
 
-_FAILURES_SHOWN = 5
-_FOLDERS_SHOWN = 8
+_ELSEWHERE = "paths.data_dir"
+_SHOWN = 5  # failures in the log
+_JUDGED = 20  # meshes whose size is looked at, evenly over all of them
 
 
 def generate(cfg: DictConfig) -> PointSet:
@@ -65,92 +78,60 @@ def generate(cfg: DictConfig) -> PointSet:
 
     Returns:
         The dataset.
-
-    Raises:
-        ConfigError: a setting is wrong, or the folder holds another dataset.
-        MissingDataError: the mesh folder or one of its classes is not there.
-        RenderError: the renderer cannot be used on this machine.
-        DataError: every object failed (or, with strict=true, any), the disk is full, or the
-            folder holds, or the domain has, a published dataset.
     """
-    check(cfg)
-    domain: Domain = build(cfg.domain)
-    folder = domain.folder
-    _check_place(domain, cfg.force)
-    items = mesh_items(cfg)
+    plan = planned(cfg)
+    domain, folder, items = plan.domain, plan.domain.folder, plan.items
+    _check_place(domain, plan.options.force)
     pool: Pool = build(cfg.engine)
-    parts = Parts(folder)
+    parts = PartFiles(folder)
     job = Job(
-        recipe=build(cfg.recipe),
-        make_renderer=partial(build, OmegaConf.to_container(cfg.renderer, resolve=True)),
-        seed=cfg.seed,
-        keep=keep(cfg, items, folder),
-        save=parts.save,
+        recipe=plan.recipe,
+        make_renderer=partial(build, plan.renderer),
+        seed=plan.options.seed,
+        keep=plan.keep(folder),
+        save=partial(save_part, parts),
     )
-    check_recipe(job.recipe, cfg)
-    check_folder(folder, cfg.paths.data_dir)
-    other = f"wait for it, or give another {ELSEWHERE}"
-    with (
-        owned(folder, doing="making the dataset in", advice=other),
-        disk_errors_explained(folder, lambda: parts.state(len(items))),
-    ):
+    with owned(folder, doing="making the dataset in", advice=f"or give another {_ELSEWHERE}"):
         renderer = renderer_provenance(job)
-        recipe = describe(cfg, items, renderer)
-        if cfg.force:  # not before: without a renderer nothing would take its place
+        recipe = plan.describe(renderer)
+        if plan.options.force:  # not before: without a renderer nothing would take its place
             delete_dataset(folder)
         if is_finished(folder):
             parts.check(recipe)
             parts.clear()  # a kill after the last write leaves them
             log.info("%s is already there: %s", domain.label, folder)
             pointset = open_pointset(folder, domain.variant)
-            _warn_of_failed(pointset, items, folder)
-            _check_strict(cfg, pointset, items, folder)
+            _judge_failed(plan, pointset)
             return pointset
         start = time.perf_counter()
-        _warn_of_meshes(cfg, job, items)
-        parts.begin_by(code_fingerprint(), recipe)
+        _warn_of_sizes(plan.recipe, items)
+        _begin(parts, recipe)
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
             job = replace(job, expected={**software(), **renderer}, check_place=place)
-        passing = _scan_missing(job, items, parts, pool, _heading(domain))
+        passing = _scan_missing(job, items, parts, pool, domain.label)
         outcomes = _collect(items, parts, passing, folder)
         # The dataset last: with meta.yaml it counts as finished, and the parts can go.
-        _draw(domain, items, outcomes, folder)
+        _draw(domain, items, outcomes)
         write_text(folder / CONFIG, OmegaConf.to_yaml(cfg, resolve=True))
-        write_text(folder / COSTS, _costs(items, outcomes))
-        pointset = _write(domain, items, outcomes, recipe, cfg)
+        write_text(folder / COSTS, _costs(outcomes))
+        pointset = _write(plan, outcomes, recipe)
         parts.clear()
-    _report(pointset, items, outcomes, folder, time.perf_counter() - start)
-    stated = stated_hash(cfg, recipe)
+    _report(pointset, items, outcomes, time.perf_counter() - start)
+    stated = plan.stated_hash(recipe)
     if stated and stated != pointset.sha256:
         log.warning(
             "the stated content hash is %s: another processor or library version made other bytes",
             stated[:16],
         )
-    _check_strict(cfg, pointset, items, folder)
+    _judge_failed(plan, pointset)
     return pointset
-
-
-def _warn_of_meshes(cfg: DictConfig, job: Job, items: list[MeshItem]) -> None:
-    """What of the user's meshes will not come out as one may think."""
-    if cfg.meshes is not None and (unread := mesh_folder(cfg).unread()):
-        log.warning(
-            "left out, because this format is not read: %s: export STL, OBJ or glTF",
-            unread[0] if len(unread) == 1 else f"{unread[0]} and {len(unread) - 1} more",
-        )
-    warn_of_sizes(getattr(job.recipe, "placing", None), items)
 
 
 def _check_place(domain: Domain, force: bool) -> None:
     """Raise where the dataset would replace, or pass for, one that was not made here."""
-    try:
-        check_ours(domain.folder, "generate.py")
-        domain.check_unpublished()
-    except OSError as error:  # a name that no folder can have
-        raise ConfigError(
-            f"cannot make the folder {domain.folder}: {error.strerror}; choose another one, "
-            "paths.data_dir=PATH"
-        ) from error
+    check_ours(domain.folder, "generate.py")
+    domain.check_unpublished()
     if force and domain.folder != Path(domain.path).absolute():
         raise ConfigError(
             f"{domain.name} is part of the dataset in {domain.folder}, and force=true would "
@@ -158,33 +139,74 @@ def _check_place(domain: Domain, force: bool) -> None:
         )
 
 
-def _warn_of_failed(pointset: PointSet, items: list[MeshItem], folder: Path) -> None:
-    """Of a dataset that is there already: what it lacks, which its first run said."""
-    failed = len(items) - len(pointset.ids)
+def _judge_failed(plan: Plan, pointset: PointSet) -> None:
+    """Warn of the objects that a dataset lacks; with strict=true they are an error."""
+    failed = len(plan.items) - len(pointset.ids)
     if not failed:
         return
-    there = {pointset.classes[label] for label in pointset.labels}
-    none = sorted({item.cls for item in items} - there)
-    has = f"; no object of {', '.join(none)} is in it" * bool(none)
+    path = plan.domain.folder / MANIFEST
+    if plan.options.strict:
+        raise DataError(f"{failed} of {len(plan.items)} objects failed; see {path}")
+    none = sorted(
+        {item.cls for item in plan.items} - {pointset.classes[i] for i in pointset.labels}
+    )
     log.warning(
-        "%d of %d objects had failed (%s says why)%s", failed, len(items), folder / MANIFEST, has
+        "%d of %d objects failed (see %s)%s",
+        failed,
+        len(plan.items),
+        path,
+        f"; no object of {', '.join(none)} is in it" * bool(none),
     )
 
 
-def _check_strict(cfg: DictConfig, pointset: PointSet, items: list[MeshItem], folder: Path) -> None:
-    failed = len(items) - len(pointset.ids)
-    if cfg.strict and failed:
-        raise DataError(f"{failed} of {len(items)} objects failed; see {folder / 'manifest.csv'}")
+def _begin(parts: PartFiles, recipe: dict[str, Any]) -> None:
+    """Start, or continue what the same code made with the same recipe.
+
+    A finished dataset is not asked for its code, as every change would make it another.
+    """
+    parts.begin(recipe)
+    file, code = parts.folder / PARTS / "code.txt", code_fingerprint()
+    if parts.count() and (not file.is_file() or file.read_text() != code):
+        raise ConfigError(
+            f"{parts.folder} was begun with another version of qs3's code, which may make other "
+            f"clouds: finish it with that version, or give another {_ELSEWHERE} or force=true"
+        )
+    write_text(file, code)
+
+
+def _warn_of_sizes(recipe: Any, items: Sequence[MeshItem]) -> None:
+    """Warn of files that are not in metres, where objects keep their size, before hours of scans.
+
+    `RealSize` makes any mesh of an implausible size as large as it takes an object to be, so that
+    millimetres give a dataset in which all objects are of one size.
+    """
+    placing, files = getattr(recipe, "placing", None), [item for item in items if item.path]
+    if not isinstance(placing, RealSize) or not files:
+        return
+    few = np.unique(np.linspace(0, len(files) - 1, _JUDGED).round().astype(int))
+    lost = 0
+    for item in (files[i] for i in few):
+        try:
+            lost += not placing.keeps(item.load())
+        except DataError:  # it will be recorded when it is scanned
+            continue
+    if lost:
+        log.warning(
+            "%d of %d meshes looked at are not in metres: each is scaled to %g m",
+            lost,
+            len(few),
+            placing.fallback_side_m,
+        )
 
 
 def _scan_missing(
-    job: Job, items: list[MeshItem], parts: Parts, pool: Pool, label: str
+    job: Job, items: list[MeshItem], parts: PartFiles, pool: Pool, label: str
 ) -> dict[str, Outcome]:
     """Scan what has no part yet; the failures that are not the objects' fault, by id.
 
     Those get no part: should this run be interrupted, the next one tries them again.
     """
-    missing = [item for item in items if not parts.done(item.id)]
+    missing = [item for item in items if not has_part(parts, item.id)]
     passing = {}
     if len(missing) < len(items):
         log.info("continuing: %d of %d objects are done", len(items) - len(missing), len(items))
@@ -193,7 +215,7 @@ def _scan_missing(
             if not outcome.lasting:
                 passing[outcome.item_id] = outcome
             elif not outcome.saved:
-                parts.save(outcome)
+                save_part(parts, outcome)
             advance()
             if outcome.reason:
                 log.warning("%s: %s", outcome.item_id, outcome.reason)
@@ -201,34 +223,22 @@ def _scan_missing(
 
 
 def _collect(
-    items: list[MeshItem], parts: Parts, passing: dict[str, Outcome], folder: Path
+    items: list[MeshItem], parts: PartFiles, passing: dict[str, Outcome], folder: Path
 ) -> list[Outcome]:
-    """One outcome an item.
-
-    Raises:
-        MissingDataError: meshes could not be read any more; the parts of the others stay.
-        DataError: no object gave a cloud.
-    """
+    """One outcome an item."""
     if gone := [outcome for outcome in passing.values() if outcome.unavailable]:
         raise MissingDataError(
             f"{len(gone)} of {len(items)} meshes cannot be read any more; the first: "
-            f"{gone[0].reason}. Run the same command again when they can: "
-            f"{parts.state(len(items))}"
+            f"{gone[0].reason}. Run the same command again when they can: what is done is kept"
         )
-    outcomes: list[Outcome] = []
-    for item in items:
-        outcome = passing.get(item.id) or parts.load(item.id)
-        if outcome is None:
-            raise DataError(f"the part of {item.id} is gone: run the same command again")
-        outcomes.append(outcome)
+    outcomes = [passing.get(item.id) or load_part(parts, item.id) for item in items]
     if all(outcome.cloud is None for outcome in outcomes):
         delete_dataset(folder)  # nothing is lost, and corrected settings are not refused
-        one = "the only object" if len(items) == 1 else f"all {len(items)} objects"
-        raise DataError(f"{one} failed; the first: {items[0].id}: {outcomes[0].reason}")
+        raise DataError(f"all objects failed; the first: {items[0].id}: {outcomes[0].reason}")
     return outcomes
 
 
-def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome], folder: Path) -> None:
+def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome]) -> None:
     """clouds.png and, where something was looked at, infrared.png: for people only."""
     clouds: dict[str, list[Any]] = {item.cls: [] for item in items}
     previews = {}
@@ -239,119 +249,98 @@ def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome], folder
             clouds[item.cls].append(outcome.cloud.arrays)
         if outcome.cloud.preview and item.cls not in previews:
             previews[item.cls] = (item.id, outcome.cloud.preview)
-    heading = _heading(domain)
-    twin = any("points_clean" in arrays for some in clouds.values() for arrays in some)
-    clouds_picture(folder / CLOUDS, clouds, heading, twin)
+    clouds_picture(domain.folder / CLOUDS, clouds, domain.label)
     if previews:
-        infrared_picture(folder / INFRARED, previews, heading)
+        infrared_picture(domain.folder / INFRARED, previews, domain.label)
 
 
-def _heading(domain: Domain) -> str:
-    """What its pictures are called: classes of one's own are another dataset than the published."""
-    own = domain.classes is not None and not isinstance(domain.classes, str)
-    return f"{domain.folder.name}, scanned as {domain.label}" if own else domain.label
-
-
-def _costs(items: list[MeshItem], outcomes: list[Outcome]) -> str:
-    """costs.csv. Not in manifest.csv, which is the same whoever scanned the objects."""
+def _costs(outcomes: list[Outcome]) -> str:
+    """costs.csv. Not in manifest.csv, which is the same wherever the objects were scanned."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("id", "seconds", "peak_memory_mb"))
-    for item, outcome in zip(items, outcomes, strict=True):
-        rows.writerow((item.id, f"{outcome.seconds:g}", f"{outcome.memory_mb:g}"))
+    for outcome in outcomes:
+        rows.writerow((outcome.item_id, f"{outcome.seconds:g}", f"{outcome.memory_mb:g}"))
     return text.getvalue()
 
 
-def _write(
-    domain: Domain, items: list[MeshItem], outcomes: list[Outcome], recipe: Any, cfg: DictConfig
-) -> PointSet:
-    good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
-    made = made_of(
-        cfg,
-        (item.cls for item, o in zip(items, outcomes, strict=True) if o.cloud is not None),
-        (outcome.mesh_sha256 for outcome in outcomes),
-        benchmark(cfg, recipe),
-        recipe_fingerprint(recipe, (o.item_id for o in outcomes if o.cloud is not None)),
-    )
-    others = left_alone(cfg)
+class _Arrays(Sequence[np.ndarray]):
+    """One array of many clouds, each read when it is asked for."""
+
+    def __init__(self, clouds: Sequence[Cloud], name: str) -> None:
+        self._clouds, self._name = clouds, name
+
+    def __len__(self) -> int:
+        return len(self._clouds)
+
+    @overload
+    def __getitem__(self, key: int) -> np.ndarray: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> list[np.ndarray]: ...
+
+    def __getitem__(self, key: int | slice) -> np.ndarray | list[np.ndarray]:
+        if isinstance(key, slice):
+            return [cloud.arrays[self._name] for cloud in self._clouds[key]]
+        return self._clouds[key].arrays[self._name]
+
+
+def _write(plan: Plan, outcomes: list[Outcome], recipe: dict[str, Any]) -> PointSet:
+    own, domain = plan.options.meshes is not None, plan.domain
+    root = f"{plan.mesh_root}/"  # a manifest is the same wherever the folder lies
     rows = [
         ManifestRow(
             id=item.id,
             cls=item.cls,
             split=item.split,
-            seed=cfg.seed,
+            seed=plan.options.seed,
             mesh_sha256=outcome.mesh_sha256,
             origin=item.origin,
             views=outcome.cloud.views if outcome.cloud else None,
             valid_points=outcome.cloud.valid_points if outcome.cloud else None,
             status="ok" if outcome.cloud else "failed",
-            reason=_without_root(outcome.reason, cfg) or outcome.note,
+            reason=(outcome.reason.replace(root, "") if own else outcome.reason) or outcome.note,
         )
-        for item, outcome in zip(items, outcomes, strict=True)
+        for item, outcome in zip(plan.items, outcomes, strict=True)
     ]
-    made_here = write_pointset(
+    others = plan.mesh_folder.left_alone() if own else []
+    good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
+    written = write_pointset(
         domain.folder,
         name=domain.folder.name,
         classes=domain.names,
-        arrays={name: InParts(good, name) for name in good[0].arrays},
+        arrays={name: _Arrays(good, name) for name in good[0].arrays},
         rows=rows,
         meta={
             "simulated": domain.simulated,
-            **made.meta,
+            **made_of(plan, outcomes, recipe).meta,
             **({"folders_left_alone": {"count": len(others), "names": others}} if others else {}),
             "settings": recipe["settings"],
             "versions": recipe["versions"],
-            "config": stored_config(cfg),
+            "config": plan.stored_config(),
         },
-        tables={"provenance": PROVENANCE} if cfg.provenance else None,
+        tables={"provenance": PROVENANCE} if plan.options.provenance else None,
     )
     if domain.variant == "points":
-        return made_here
+        return written
     return open_pointset(domain.folder, domain.variant, verify=False)
 
 
-def _without_root(reason: str, cfg: DictConfig) -> str:
-    """The reason with paths relative to the mesh folder: a manifest is the same anywhere."""
-    if cfg.meshes is None:
-        return reason
-    root = mesh_root(cfg)
-    return reason.replace(f"{root.resolve()}/", "").replace(f"{root}/", "")
-
-
 def _report(
-    pointset: PointSet, items: list[MeshItem], outcomes: list[Outcome], folder: Path, seconds: float
+    pointset: PointSet, items: list[MeshItem], outcomes: list[Outcome], seconds: float
 ) -> None:
     """Counts a class, failures with their reasons, where things are, and the content hash."""
     failures = [o for o in outcomes if o.cloud is None]
     failed = Counter(item.cls for item, o in zip(items, outcomes, strict=True) if o.cloud is None)
     for line in counts_text(pointset, "failed", failed):
         log.info("%s", line)
-    for outcome in failures[:_FAILURES_SHOWN]:
+    for outcome in failures[:_SHOWN]:
         log.warning("failed: %s: %s", outcome.item_id, outcome.reason)
-    if len(failures) > _FAILURES_SHOWN:
-        more = len(failures) - _FAILURES_SHOWN
-        log.warning("and %d more: %s says why", more, folder / "manifest.csv")
     if passing := sum(not outcome.lasting for outcome in failures):
-        log.warning(
-            "%s not by fault of the mesh itself: force=true makes the dataset again",
-            counted(passing, "object failed", "objects failed"),
-        )
+        log.warning("%d failed not by fault of the mesh: force=true makes it again", passing)
     if noted := sum(COLLIDERS in outcome.note for outcome in outcomes):
-        hold = counted(noted, "file holds", "files hold")
-        log.info("%s colliders, which were left out (manifest.csv); colliders=keep", hold)
-    if drawn := sum(DRAWN in outcome.note for outcome in outcomes):
-        log.info(
-            "files that do not say of all their faces what they are made of: %d of %d; for the "
-            "other faces materials were drawn (manifest.csv)",
-            drawn,
-            len(outcomes),
-        )
+        log.info("%d files hold colliders, which were left out; see colliders=keep", noted)
     if others := pointset.meta.get("folders_left_alone"):
-        names, count = others["names"][:_FOLDERS_SHOWN], others["count"]
-        more = ", ..." * (count > len(names))
-        left = counted(count, "folder of another class was", "folders of other classes were")
-        log.info("%s left alone: %s%s", left, ", ".join(names), more)
+        log.info("folders of other classes: %s", ", ".join(others["names"]))
     log.info("made of: %s", pointset.made_of)
-    pictures = " and ".join(n for n in (CLOUDS, INFRARED) if (folder / n).is_file())
-    log.info("in %s: look at %s", folder, pictures)
     log.info("content hash %s, %.0f s", pointset.sha256[:16], seconds)

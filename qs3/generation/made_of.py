@@ -5,49 +5,54 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.compose import choices, composed
-from qs3.generation.objects import known_classes, mesh_root
+from qs3.generation.plan import Plan, recipe_fingerprint
 from qs3.store.meta import MadeOf
 
+if TYPE_CHECKING:
+    from qs3.generation.workers import Outcome
 
-def made_of(
-    cfg: DictConfig,
-    classes: Iterable[str],
-    meshes: Iterable[str],
-    benchmark: str,
-    recipe: str = "",
-) -> MadeOf:
+_MATERIALS = {
+    "mixed": "mixed materials",
+    "clear": "mixed and clear materials",
+    "principled": "principled materials",
+}
+_LIGHTS = {"area": "light above", "bounced": "light between surfaces"}
+_MOST = 3  # settings are named
+_LENGTH = 40  # of a value that is named
+
+
+def made_of(plan: Plan, outcomes: Sequence[Outcome], recipe: Mapping[str, Any]) -> MadeOf:
     """The line for figures; of a folder of meshes its last name, and not where it lies.
 
     Args:
-        cfg: conf/generate.yaml, composed.
-        classes: of the objects.
-        meshes: hash of each mesh that could be read.
-        benchmark: see `qs3.generation.plan.benchmark`.
-        recipe: see `qs3.generation.recipe_fingerprint`.
+        plan: what was made.
+        outcomes: of its objects.
+        recipe: of `Plan.describe`.
     """
     objects = "embedded catalogue"
-    if cfg.meshes is not None:
-        root = mesh_root(cfg).resolve()
+    if plan.options.meshes is not None:
+        root = plan.mesh_root.resolve()
         # Below `raw/` PyTorch Geometric and `qs3 download` keep what a dataset is made from.
         objects = f"meshes of {(root.parent if root.name == 'raw' else root).name}"
-        objects += " and the embedded catalogue" * cfg.fill_up
-    there = set(classes)
-    several = "\n".join(sorted(set(meshes) - {""}))
+        objects += " and the embedded catalogue" * plan.options.fill_up
+    made = {outcome.item_id for outcome in outcomes if outcome.cloud is not None}
+    there = {item.cls for item in plan.items if item.id in made}
+    several = "\n".join(sorted({outcome.mesh_sha256 for outcome in outcomes} - {""}))
     return MadeOf(
         objects=objects,
-        sensor=_sensor(cfg),
-        views=cfg.views,
-        without=", ".join(name for name in known_classes(cfg) if name not in there),
-        benchmark=benchmark,
+        sensor=_sensor(plan.cfg),
+        views=plan.cfg.views,
+        without=", ".join(name for name in plan.domain.names if name not in there),
+        benchmark=plan.benchmark(recipe),
         meshes=hashlib.sha256(several.encode()).hexdigest()[:12],
-        recipe=recipe,
+        recipe=recipe_fingerprint(recipe, made),
     )
 
 
@@ -67,7 +72,7 @@ def _files(group: str) -> dict[str, Any]:
 
 def _sensor(cfg: DictConfig) -> str:
     """The preset, materials and light, each with what was changed, and errors taken out."""
-    if not cfg.sensor:
+    if not cfg.get("sensor"):
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
     words = [_own_preset() or _named("sensor", cfg.sensor)]
@@ -93,17 +98,6 @@ def _own_preset() -> str:
     words = [word.lstrip("+~") for word in hydra.overrides.task]
     changed = [word.removeprefix("sensor.") for word in words if word.startswith("sensor.")]
     return _with(name, changed)
-
-
-_MATERIALS = {
-    "mixed": "mixed materials",
-    "own": "the files' materials",
-    "clear": "mixed and clear materials",
-    "principled": "principled materials",
-}
-_LIGHTS = {"area": "light above", "bounced": "light between surfaces"}
-_MOST = 3  # settings are named
-_LENGTH = 40  # of a value that is named
 
 
 def _named(

@@ -1,34 +1,35 @@
-"""What bodies are made of: materials drawn for the parts of an object, and for all around it."""
+"""What bodies are made of, and the light of the place where they are scanned."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
+from annotated_types import Ge, Interval
 from jaxtyping import Int
 
-from qs3.config.checks import check_bool, check_float, check_int
-from qs3.errors import ConfigError
-from qs3.meshes.finishes import NONE, Finish
 from qs3.meshes.mesh import Mesh
-from qs3.sensors.renderers.base import Body
+from qs3.meshes.placement import Positive, Share
+from qs3.sensors.base import Lighting
+from qs3.sensors.renderers.base import AreaLight, Body
 from qs3.sensors.renderers.gloss import Gloss
+from qs3.utils.settings import settings
 
 Surface = tuple[float, Gloss]
 """Albedo and gloss."""
 
 _SAME = 1e-5  # of the largest side: vertices nearer to each other are one
-INFRARED_ALBEDO = (0.03, 0.9)
-"""From carbon black to the brightest of conf/materials/mixed.yaml: what a guess may be."""
-DRAWN = "materials drawn"
-"""Begins the note of an object that has not all of its own."""
-
 _ALIKE = 1e-3  # of the largest side: parts whose sides differ by less are alike
 
+NotNegative = Annotated[float, Ge(0)]
+Bounces = Annotated[int, Interval(ge=0, le=1)]
+Rough = Annotated[float, Interval(ge=0.1, le=1)]
+Clear = Annotated[float, Interval(ge=0, le=0.95)]
 
-@dataclass(frozen=True)
+
+@settings
 class Kind:
     """One kind of material; each range is [lowest, highest], drawn evenly.
 
@@ -38,12 +39,12 @@ class Kind:
         roughness, specular, metal, transmission: see `Gloss`.
     """
 
-    weight: float
-    albedo: tuple[float, float]
-    roughness: tuple[float, float]
-    specular: tuple[float, float] = (0.5, 0.5)
+    weight: NotNegative
+    albedo: tuple[Share, Share]
+    roughness: tuple[Rough, Rough]
+    specular: tuple[Share, Share] = (0.5, 0.5)
     metal: bool = False
-    transmission: tuple[float, float] | None = None
+    transmission: tuple[Clear, Clear] | None = None
 
     def draw(self, rng: np.random.Generator) -> Surface:
         """Albedo and gloss of one surface."""
@@ -55,7 +56,7 @@ class Kind:
         return albedo, Gloss(roughness, specular, self.metal, clear)
 
 
-@dataclass(frozen=True)
+@settings
 class MixedMaterials:
     """Every object has a few materials, each of its parts one of them; other bodies have one each.
 
@@ -64,18 +65,11 @@ class MixedMaterials:
 
     Attributes:
         max_materials: of an object; the number is uniform.
-        kinds: by name; a mapping in the place of a `Kind` holds its fields.
+        kinds: by name.
     """
 
-    kinds: Mapping[str, Any]
-    max_materials: int = 3
-
-    def __post_init__(self) -> None:
-        check_int("materials.max_materials", self.max_materials, 1)
-        kinds = {name: checked_kind(name, fields) for name, fields in self.kinds.items()}
-        object.__setattr__(self, "kinds", kinds)
-        if not sum(kind.weight for kind in kinds.values()) > 0:
-            raise ConfigError("materials.kinds: no kind has a weight above 0")
+    kinds: Mapping[str, Kind]
+    max_materials: Annotated[int, Ge(1)] = 3
 
     def dress(self, bodies: Sequence[Body], rng: np.random.Generator) -> tuple[Body, ...]:
         """The same shapes with materials; the first body, the object, as one body a material."""
@@ -91,10 +85,6 @@ class MixedMaterials:
             dressed.append(Body(body.mesh, albedo, body.label, gloss))
         return tuple(dressed)
 
-    def note(self, mesh: Mesh) -> str:
-        """What a manifest should say of an object's materials; nothing here."""
-        return ""
-
     def _surfaces(
         self, mesh: Mesh, rng: np.random.Generator
     ) -> tuple[list[Surface], Int[np.ndarray, " f"]]:
@@ -104,51 +94,10 @@ class MixedMaterials:
         return materials, rng.integers(0, len(materials), parts.max() + 1)[parts]
 
     def _draw(self, rng: np.random.Generator) -> Surface:
-        kinds: list[Kind] = list(self.kinds.values())
+        kinds = list(self.kinds.values())
         ends = np.cumsum([kind.weight for kind in kinds])
         place = rng.uniform(0, ends[-1])
         return kinds[int(np.searchsorted(ends, place, side="right"))].draw(rng)
-
-
-@dataclass(frozen=True)
-class OwnMaterials(MixedMaterials):
-    """What mesh files say their faces are made of; the rest is drawn as `MixedMaterials` draws it.
-
-    A face of which the file says nothing, or whose colour lies in a picture, has the material that
-    it would have without the file's; so has every other body.
-    """
-
-    def note(self, mesh: Mesh) -> str:
-        """How many faces have drawn materials; empty if none has."""
-        found, faces = mesh.finishes, len(mesh.faces)
-        if found is None:
-            return f"{DRAWN}: the file has none that are read"
-        if not found.missing:
-            return ""
-        pictures = f", {found.pictured} of them in pictures, which are not read"
-        return f"{DRAWN} for {found.missing} of {faces} faces" + pictures * bool(found.pictured)
-
-    def _surfaces(
-        self, mesh: Mesh, rng: np.random.Generator
-    ) -> tuple[list[Surface], Int[np.ndarray, " f"]]:
-        drawn, chosen = super()._surfaces(mesh, rng)
-        if mesh.finishes is None:
-            return drawn, chosen
-        own = [surface_of(finish) for finish in mesh.finishes.kinds]
-        of_face = mesh.finishes.of_face
-        return [*drawn, *own], np.where(of_face == NONE, chosen, len(drawn) + of_face)
-
-
-def surface_of(finish: Finish) -> Surface:
-    """The surface in the near infrared of what a file says of the visible one.
-
-    The colour's brightest channel, clipped to `INFRARED_ALBEDO`: a dye that is dark in one colour
-    and bright in another is an organic one, and these are clear in the infrared, where the surface
-    is at least as bright as anywhere; grey and black that come from carbon stay as they are.
-    """
-    albedo = float(np.clip(max(finish.colour), *INFRARED_ALBEDO))
-    roughness = float(np.clip(finish.roughness, 0.1, 1))
-    return albedo, Gloss(roughness, finish.specular, finish.metal, min(finish.clear, 0.95))
 
 
 def parts_of(mesh: Mesh) -> Int[np.ndarray, " f"]:
@@ -184,26 +133,58 @@ def _faces_of(mesh: Mesh, wanted: np.ndarray) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
 
 
-def checked_kind(name: str, fields: Any) -> Kind:
-    """A kind of material; ConfigError names the key that is wrong."""
-    place = f"materials.kinds.{name}"
-    if isinstance(fields, Kind):
-        return fields
-    try:
-        kind = Kind(**fields)
-    except TypeError as error:
-        raise ConfigError(f"{place}: {error}") from error
-    check_float(f"{place}.weight", kind.weight, ">= 0")
-    check_bool(f"{place}.metal", kind.metal)
-    ranges = {"albedo": "[0, 1]", "roughness": "[0.1, 1]", "specular": "[0, 1]"}
-    if kind.transmission is not None:
-        ranges["transmission"] = "[0, 0.95]"
-    for key, allowed in ranges.items():
-        ends = getattr(kind, key)
-        if not isinstance(ends, list | tuple) or len(ends) != 2:
-            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r:.80}")
-        for end in ends:
-            check_float(f"{place}.{key}", end, allowed)
-        if ends[0] > ends[1]:
-            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r}")
-    return kind
+@runtime_checkable
+class Light(Protocol):
+    """What a recipe's `light` is."""
+
+    def over(self, box_m: np.ndarray) -> Lighting:
+        """The light about an object with box [2, 3]."""
+
+
+@settings
+class SensorLight:
+    """The sensor's own light alone, and what surfaces in it give each other.
+
+    Attributes:
+        bounces: 1: surfaces light each other, once; see `Scene.bounces`. 0: they do not.
+        ambient: of light from all sides, in place of `sensor.ambient`; null: that.
+    """
+
+    bounces: Bounces = 1
+    ambient: NotNegative | None = None
+
+    def over(self, box_m: np.ndarray) -> Lighting:
+        """The same wherever the object is."""
+        return Lighting(None, self.ambient, self.bounces)
+
+
+@settings
+class LightAbove:
+    """The paper's light (section 3.1): one area light on top of the object, a level square.
+
+    Attributes:
+        height_m: over the object's highest point.
+        side_m: of the square, whose middle is over the object's.
+        strength: radiance of a white level surface there, in the units of `sensor.ambient`: with
+            sensor=speckle_stereo a lit dot on white has 1 at 4 m.
+        ambient: of light from all sides, in place of `sensor.ambient`; null: that.
+        bounces: 1: surfaces in the projector's light light each other, once.
+    """
+
+    height_m: Positive = 1.5
+    side_m: Positive = 24.34
+    strength: NotNegative = 0.15
+    ambient: NotNegative | None = None
+    bounces: Bounces = 0
+
+    def over(self, box_m: np.ndarray) -> Lighting:
+        """Over an object with box [2, 3]."""
+        middle = box_m.mean(axis=0)
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])  # it looks down
+        pose[:3, 3] = middle[0], middle[1], box_m[1, 2] + self.height_m
+        # The share of what a point sees above itself that the square fills, by cosines.
+        slope = self.side_m / (2 * self.height_m)
+        part = slope / math.hypot(1, slope)
+        seen = 4 / math.pi * part * math.atan(part)
+        area = AreaLight(pose, self.side_m, self.strength / seen)
+        return Lighting(area, self.ambient, self.bounces)

@@ -1,170 +1,379 @@
-"""What generate.py is about to do, written down: what decides the bytes of a dataset."""
+"""What generate.py is about to do: its config, built and judged in one place, and written down.
+
+What is written down decides the bytes of a dataset: a resume is compared with it.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import ast
+import dataclasses
+import functools
 import hashlib
 import json
+import math
 import platform
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from annotated_types import Ge, Gt, Le, Lt, MinLen
 from omegaconf import DictConfig, OmegaConf
+from pydantic import ValidationError
 
+from qs3.catalogue import Catalogue
+from qs3.classes import CLASSES
 from qs3.config.hydra import build
-from qs3.errors import MeshError
-from qs3.generation.objects import catalogue_seed, mesh_items, own_materials
-from qs3.generation.provenance import Keep
-from qs3.generation.released.poses import read_poses
-from qs3.generation.twins import TWINS
-from qs3.meshes.formats.gltf import buffer_files
-from qs3.meshes.formats.mtl import libraries
-from qs3.meshes.source import MeshItem
+from qs3.datasets.domain import Domain
+from qs3.errors import ConfigError
+from qs3.generation.camera_poses import Drift
+from qs3.generation.kept import Keep
+from qs3.generation.released import read_poses
+from qs3.generation.room_scans import RoomScan
+from qs3.meshes.folder import SPLITS, MeshFolder
+from qs3.meshes.gltf import buffer_files
+from qs3.meshes.io import Up
+from qs3.meshes.mesh import MeshItem
 from qs3.store.parts import VIEWS as VIEWS_FOLDER
 from qs3.utils.files import sha256_file
+from qs3.utils.settings import problems, settings
 from qs3.utils.version import VERSION
 
+_ROOT = Path(__file__).resolve().parents[1]
+MAKES_CLOUDS = (
+    *("catalogue", "generation", "meshes", "sensors"),
+    *("geometry/cameras.py", "geometry/sampling.py"),
+    *("datasets/cutting.py", "datasets/depth_images.py", "datasets/regions.py"),
+    *("utils/seeding.py", "classes.py"),
+)
+"""Folders and modules that decide the bytes of a cloud."""
+
+_ADDED = "catalogue-"  # before the names of objects that fill up the user's
+_OTHER_HALF = 1000
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
-# Keys of a config that say where things lie, or that never change a byte.
+# Keys of a config that name places, or that never change a byte.
 _UNSTORED = ("paths", "workers", "engine", "force", "strict")
+_OF_LOOKING = ("sensor", "views", "provenance", "keep_views", "poses")
 
 
-def keep(cfg: DictConfig, items: Sequence[MeshItem], folder: Path) -> Keep:
-    """What is wanted besides the clouds: provenance, views, and previews of some objects."""
-    seen: Counter[str] = Counter()
-    previews = []
-    for item in items:
-        if seen[item.cls] < _PREVIEWS:
-            previews.append(item.id)
-        seen[item.cls] += 1
-    return Keep(
-        provenance=cfg.provenance,
-        views=folder / VIEWS_FOLDER if cfg.keep_views else None,
-        twins=frozenset(cfg.twins),
-        previews=frozenset(previews),
-    )
+@settings
+class Options:
+    """The plain settings of conf/generate.yaml, which describes them."""
+
+    seed: Annotated[int, Ge(0)]
+    meshes: Annotated[str, MinLen(1)] | None
+    fill_up: bool
+    poses: Annotated[str, MinLen(1)] | None
+    half: Literal["all", "first", "second"]
+    test_fraction: Annotated[float, Gt(0), Lt(1)]
+    up: Up
+    colliders: Literal["skip", "keep"]
+    classes: Annotated[tuple[str, ...], MinLen(1)] | None
+    splits: Annotated[tuple[Literal["train", "test"], ...], MinLen(1)] | None
+    limit: Annotated[int, Ge(1)] | None
+    fraction: Annotated[float, Gt(0), Le(1)]
+    scans: Annotated[int, Ge(1)]
+    provenance: bool
+    keep_views: bool
+    workers: Annotated[int, Ge(0)]
+    force: bool
+    strict: bool
 
 
-def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -> dict[str, Any]:
-    """All that decides the bytes of a dataset: what a resume is compared with.
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A config of generate.py, built and judged.
 
-    A folder of meshes is described by the content of its files, not by where it lies.
+    Attributes:
+        cfg: conf/generate.yaml, composed.
+        options: its plain settings.
+        domain: what is made.
+        recipe: a `Recipe`, with the fields of its class.
     """
-    return {
-        "kept": [
-            *(key for key in ("provenance", "keep_views") if cfg[key]),
-            *(f"twins={name}" for name in TWINS if name in cfg.twins),
-        ],
-        "settings": settings(cfg),
-        "objects": [_name_and_content(item, own_materials(cfg)) for item in items],
-        "versions": {
-            **renderer,
-            "qs3": VERSION,
-            "numpy": version("numpy"),
-            "opencv": version("opencv-python-headless"),
-            "fpsample": version("fpsample"),
-            "machine": platform.machine(),
-        },
+
+    cfg: DictConfig
+    options: Options
+    domain: Domain
+    recipe: Any
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The wanted ones, in label order."""
+        wanted = self.options.classes or self.domain.names
+        return tuple(name for name in self.domain.names if name in wanted)
+
+    @property
+    def renderer(self) -> dict[str, Any]:
+        """How a renderer is built: plain values, for workers; empty where nothing is rendered."""
+        found: Any = OmegaConf.to_container(
+            self.cfg.get("renderer") or DictConfig({}), resolve=True
+        )
+        return dict(found)
+
+    @property
+    def mesh_root(self) -> Path:
+        """The user's folder of meshes; absolute, as workers may be in other folders."""
+        return Path(self.options.meshes or "").expanduser().absolute()
+
+    @property
+    def mesh_folder(self) -> MeshFolder:
+        """The user's meshes."""
+        return MeshFolder(
+            path=self.mesh_root,
+            classes=self.options.classes,
+            test_fraction=self.options.test_fraction,
+            half=self.options.half,
+            known=self.domain.names,
+            keep_colliders=self.options.colliders == "keep",
+            up=self.options.up,
+            optional=CLASSES if self.options.fill_up else (),
+        )
+
+    @functools.cached_property
+    def items(self) -> list[MeshItem]:
+        """The objects to scan, of the user's folder or of the embedded catalogue."""
+        own = self.options.meshes is not None
+        meshes = self._chosen(self.mesh_folder.items()) if own else self._of_the_catalogue()
+        # The same mesh under another id has other randomness; scan 0 keeps its id.
+        items = [
+            replace(item, id=f"{item.id}~{scan}") if scan else item
+            for item in meshes
+            for scan in range(self.options.scans)
+        ]
+        if own and self.options.fill_up:
+            items = self._filled_up(items)
+        names = Counter(item.id for item in items)
+        if same := [name for name, count in names.items() if count > 1]:
+            raise ConfigError(f"two objects would be called {same[0]!r}: rename a mesh file")
+        return items
+
+    @property
+    def catalogue_seed(self) -> int:
+        """Of the other half of meshes, another catalogue: those of two seeds share no mesh."""
+        other = _OTHER_HALF if self.options.half == "second" else 0
+        return int(self.cfg.catalogue.seed) + other
+
+    def _of_the_catalogue(self) -> list[MeshItem]:
+        classes = tuple(name for name in CLASSES if name in self.classes)
+        catalogue: Catalogue = build(self.cfg.catalogue, classes=classes, seed=self.catalogue_seed)
+        return self._chosen(catalogue.items())
+
+    def _chosen(self, items: Sequence[MeshItem]) -> list[MeshItem]:
+        """Those of the wanted splits, as many as `limit` and `fraction` allow."""
+        items = [item for item in items if item.split in (self.options.splits or SPLITS)]
+        totals = Counter((item.cls, item.split) for item in items)
+        seen: Counter[tuple[str, str]] = Counter()
+        kept = []
+        for item in items:
+            group = (item.cls, item.split)
+            wanted = math.ceil(self.options.fraction * totals[group] - 1e-9)
+            if seen[group] < min(wanted, self.options.limit or wanted):
+                kept.append(item)
+            seen[group] += 1
+        return kept
+
+    def _filled_up(self, own: Sequence[MeshItem]) -> list[MeshItem]:
+        """The user's scans, and of each class and split what they lack of the catalogue's number.
+
+        The catalogue's objects have ids of their own: ModelNet's files, too, are called chair_0001.
+        """
+        catalogue = self._of_the_catalogue()
+        lacking = Counter((item.cls, item.split) for item in catalogue)
+        lacking.subtract(Counter((item.cls, item.split) for item in own))
+        added = []
+        for item in catalogue:
+            if lacking[item.cls, item.split] > 0:
+                lacking[item.cls, item.split] -= 1
+                folder, stem = item.id.rsplit("/", 1)
+                added.append(replace(item, id=f"{folder}/{_ADDED}{stem}"))
+        order = {name: k for k, name in enumerate(self.domain.names)}
+        return sorted([*own, *added], key=lambda item: (order[item.cls], SPLITS.index(item.split)))
+
+    def keep(self, folder: Path) -> Keep:
+        """What is wanted besides the clouds: provenance, views, and previews of some objects."""
+        seen: Counter[str] = Counter()
+        previews = []
+        for item in self.items:
+            if seen[item.cls] < _PREVIEWS:
+                previews.append(item.id)
+            seen[item.cls] += 1
+        views = folder / VIEWS_FOLDER if self.options.keep_views else None
+        return Keep(self.options.provenance, views, frozenset(previews))
+
+    def describe(self, renderer: Mapping[str, str]) -> dict[str, Any]:
+        """All that decides the bytes of a dataset: what a resume is compared with.
+
+        A folder of meshes is described by the content of its files, not by where it lies.
+        """
+        return {
+            "kept": [key for key in ("provenance", "keep_views") if self.cfg[key]],
+            "settings": self._settings(),
+            "objects": [_name_and_content(item) for item in self.items],
+            "versions": {
+                **renderer,
+                "qs3": VERSION,
+                "numpy": version("numpy"),
+                "opencv": version("opencv-python-headless"),
+                "fpsample": version("fpsample"),
+                "machine": platform.machine(),
+            },
+        }
+
+    def _settings(self) -> dict[str, Any]:
+        """The settings that decide the bytes of an object, as plain values."""
+        plain: Any = OmegaConf.to_container(self.cfg, resolve=True)
+        meshes: Any = {**plain["catalogue"], "seed": self.catalogue_seed}
+        if self.options.meshes is not None:
+            meshes = {"folder, filled up by": meshes} if self.options.fill_up else "folder"
+        recipe = plain["recipe"]
+        poses = recipe.pop("poses", None) or {}
+        if path := poses.pop("path", None):  # a hash of them in its place
+            recipe["poses"] = {**poses, "sha256": read_poses(Path(path).expanduser()).sha256}
+        chosen = {
+            "domain": self.domain.folder.name,
+            "seed": plain["seed"],
+            "recipe": recipe,
+            "meshes": meshes,
+            "colliders": plain["colliders"],
+            "up": plain["up"],
+        }
+        if plain.get("renderer"):
+            decisive = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}
+            chosen["renderer"] = decisive
+        return chosen
+
+    def stored_config(self) -> dict[str, Any]:
+        """The composed config as meta.yaml holds it: all but places and what changes no byte."""
+        plain: Any = OmegaConf.to_container(self.cfg, resolve=False)
+        for key in _UNSTORED:
+            plain.pop(key, None)
+        for key in _NOT_DECISIVE:
+            plain.get("renderer", {}).pop(key, None)
+        plain["meshes"] = plain["meshes"] and "folder"
+        plain["poses"] = plain["poses"] and "file"
+        return plain
+
+    def benchmark(self, recipe: Mapping[str, Any]) -> str:
+        """Whether this is the benchmark that a domain's version names, a split of it, or like it.
+
+        Returns:
+            "kinectsim10 v2"; "kinectsim10 v2, train" for its train part alone, whose objects are
+            the same; "like kinectsim10 v2, but not it" where settings or objects differ; empty for
+            domains without a version.
+        """
+        stated = self.cfg.get("benchmark")
+        if stated is None:
+            return ""
+        name = f"{self.domain.name} v{stated.version}"
+        if plan_hash(recipe) == stated.plan_sha256:
+            return name
+        splits = self.options.splits
+        if splits and self.options.meshes is None:
+            whole = replace(self, options=dataclasses.replace(self.options, splits=None)).items
+            part = [_name_and_content(item) for item in whole if item.split in splits]
+            full = {**recipe, "objects": [_name_and_content(item) for item in whole]}
+            if recipe["objects"] == part and plan_hash(full) == stated.plan_sha256:
+                return f"{name}, {' and '.join(splits)}"
+        return f"like {name}, but not it (other settings or objects)"
+
+    def stated_hash(self, recipe: Mapping[str, Any]) -> str:
+        """Content hash that the benchmark should have with this renderer; empty if unknown."""
+        stated = self.cfg.get("benchmark")
+        if stated is None or plan_hash(recipe) != stated.plan_sha256:
+            return ""
+        if "width" in recipe["versions"]:  # of Mitsuba's kernels: not the one that was stated
+            return ""
+        return str(stated.content_sha256.get(recipe["versions"].get("variant"), ""))
+
+
+def planned(cfg: DictConfig) -> Plan:
+    """Build and judge a config of generate.py."""
+    try:
+        plain: Any = OmegaConf.to_container(cfg, resolve=True)
+        options = Options(**{one.name: plain[one.name] for one in dataclasses.fields(Options)})
+    except ValidationError as error:
+        raise ConfigError(problems(error)) from None
+    plan = Plan(cfg, options, build(cfg.domain), build(cfg.recipe))
+    there = plan.domain.names if options.meshes else CLASSES
+    if unknown := sorted({*(options.classes or plan.domain.names)} - {*there}):
+        raise ConfigError(f"classes: {unknown} are not among {', '.join(there)}; see meshes=PATH")
+    if unused := _unused(cfg, plan.recipe):
+        raise ConfigError(f"domain {plan.domain.name} has no use for {unused[0]}=: leave it out")
+    return plan
+
+
+def _unused(cfg: DictConfig, recipe: Any) -> list[str]:
+    """Keys that are given and that change nothing: figures would name them all the same."""
+    if not recipe.needs_renderer:
+        return [key for key in _OF_LOOKING if cfg.get(key)]
+    light = cfg.get("light")
+    no_use = {
+        "poses": "poses" not in cfg.recipe,
+        "tracking": isinstance(recipe, RoomScan) and build(cfg.tracking) != Drift(),
+        "materials": not recipe.sensor.sees_light,
+        "light": not recipe.sensor.sees_light
+        or bool(light and light.bounces and not recipe.sensor.sees_bounces),
     }
+    return [key for key, without in no_use.items() if without and cfg.get(key)]
 
 
-def settings(cfg: DictConfig) -> dict[str, Any]:
-    """The settings that decide the bytes of an object, as plain values."""
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    chosen = {
-        "domain": build(cfg.domain).folder.name,
-        "seed": plain["seed"],
-        "recipe": _with_content_of_poses(plain["recipe"]),
-        "meshes": _kind_of_meshes(plain),
-        "colliders": plain["colliders"],
-        "up": "y" if plain["up"] == "y" else "z",
-    }
-    if plain["renderer"]:
-        chosen["renderer"] = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}
-    return chosen
+def mesh_items(cfg: DictConfig) -> list[MeshItem]:
+    """The objects that a config scans."""
+    return planned(cfg).items
 
 
-def _kind_of_meshes(plain: dict[str, Any]) -> Any:
-    if plain["fill_up"]:
-        return {"folder, filled up by": {**plain["catalogue"], "seed": catalogue_seed(plain)}}
-    return "folder" if plain["meshes"] else plain["catalogue"]
-
-
-def _with_content_of_poses(recipe: dict[str, Any]) -> dict[str, Any]:
-    """The recipe with a hash of the poses in place of their path; without them, with nothing."""
-    poses = dict(recipe.get("poses") or {})
-    path = poses.pop("path", None)
-    rest = {key: value for key, value in recipe.items() if key != "poses"}
-    if path is None:
-        return rest
-    return {**rest, "poses": {**poses, "sha256": read_poses(Path(path).expanduser()).sha256}}
-
-
-def stored_config(cfg: DictConfig) -> dict[str, Any]:
-    """The composed config as meta.yaml holds it: all but places and what changes no byte."""
-    plain: Any = OmegaConf.to_container(cfg, resolve=False)
-    for key in _UNSTORED:
-        plain.pop(key, None)
-    for key in _NOT_DECISIVE:
-        plain["renderer"].pop(key, None)
-    if plain["meshes"] is not None:
-        plain["meshes"] = "folder"
-    if plain.get("poses") is not None:
-        plain["poses"] = "file"
-    return plain
-
-
-def benchmark(cfg: DictConfig, recipe: dict[str, Any]) -> str:
-    """Whether this is the benchmark that a domain's version names, a split of it, or like it.
-
-    Returns:
-        "kinectsim10 v2"; "kinectsim10 v2, train" for its train part alone, whose objects are the
-        same; "like kinectsim10 v2, but not it" where settings or objects differ; empty for
-        domains without a version.
-    """
-    stated = cfg.get("benchmark")
-    if stated is None:
-        return ""
-    name = f"{cfg.domain.name} v{stated.version}"
-    if plan_hash(recipe) == stated.plan_sha256:
-        return name
-    if cfg.splits and cfg.meshes is None:  # other meshes than the catalogue's are not it anyway
-        whole = mesh_items(OmegaConf.merge(cfg, {"splits": None}))  # type: ignore[arg-type]
-        part = [_name_and_content(item, False) for item in whole if item.split in cfg.splits]
-        full = {**recipe, "objects": [_name_and_content(item, False) for item in whole]}
-        if recipe["objects"] == part and plan_hash(full) == stated.plan_sha256:
-            return f"{name}, {' and '.join(cfg.splits)}"
-    return f"like {name}, but not it (other settings or objects)"
-
-
-def stated_hash(cfg: DictConfig, recipe: dict[str, Any]) -> str:
-    """Content hash that the benchmark should have with this renderer variant; empty if unknown."""
-    stated = cfg.get("benchmark")
-    if stated is None or plan_hash(recipe) != stated.plan_sha256:
-        return ""
-    if "width" in recipe["versions"]:  # of Mitsuba's kernels: not the one that was stated
-        return ""
-    return str(stated.content_sha256.get(recipe["versions"].get("variant"), ""))
-
-
-def plan_hash(recipe: dict[str, Any]) -> str:
-    """Hash of settings and objects, without versions and without the renderer's variant."""
+def plan_hash(recipe: Mapping[str, Any]) -> str:
+    """Hash of settings and objects, without versions, modules and the renderer's variant."""
     plan = {"settings": dict(recipe["settings"]), "objects": recipe["objects"]}
     renderer = dict(plan["settings"].get("renderer", {}))
     renderer.pop("variant", None)
     plan["settings"]["renderer"] = renderer
-    return hashlib.sha256(json.dumps(plan, sort_keys=True).encode()).hexdigest()
+    text = re.sub(r'"_target_": "[\w.]+\.', '"_target_": "', json.dumps(plan, sort_keys=True))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _name_and_content(item: MeshItem, with_materials: bool) -> str:
+def recipe_fingerprint(recipe: Mapping[str, Any], made: Iterable[str]) -> str:
+    """Twelve digits of settings, objects, libraries and code, the same on every machine.
+
+    Rays that meet an edge are decided by rounding, and compilers round differently on different
+    processors: of the same meshes, settings and code two machines may make clouds that differ in a
+    few points. Their content hashes differ, this does not, so that results may be averaged.
+
+    Args:
+        recipe: of `Plan.describe`.
+        made: ids of the objects that have a cloud.
+    """
+    of_the_machine = ("machine", "llvm", "width")
+    versions = {k: v for k, v in recipe["versions"].items() if k not in of_the_machine}
+    decides = [plan_hash(recipe), versions, code_fingerprint(), sorted(made)]
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
+
+
+@functools.cache
+def code_fingerprint(root: Path = _ROOT) -> str:
+    """Hash of the code that makes clouds: the same whatever its comments and docstrings."""
+    digest = hashlib.sha256()
+    for name in MAKES_CLOUDS:
+        for path in [root / name] if name.endswith(".py") else sorted((root / name).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            for node in ast.walk(tree):
+                if isinstance(body := getattr(node, "body", None), list):
+                    body[:] = [line for line in body if not _is_text(line)]
+            digest.update(path.relative_to(root).as_posix().encode())
+            digest.update(ast.dump(tree).encode())
+    return digest.hexdigest()
+
+
+def _is_text(line: ast.AST) -> bool:
+    return isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)
+
+
+def _name_and_content(item: MeshItem) -> str:
     if item.path is None:
         return f"{item.id} {item.origin}"
     files = [item.path, *buffer_files(item.path)]
-    if with_materials:
-        with contextlib.suppress(MeshError):  # of one object, which will fail by it
-            files += libraries(item.path)
     return f"{item.id} {item.origin} {' '.join(sha256_file(path)[:16] for path in files)}"

@@ -9,33 +9,34 @@ written into a dataset's recipe file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Protocol
 
 import cv2
 import numpy as np
+from annotated_types import Ge
+from jaxtyping import Bool, Float
+from pydantic import InstanceOf
 
-from qs3.config.checks import check_int, check_order, check_ranges
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
-from qs3.generation.depth_errors import DepthErrors
-from qs3.generation.lights import Light
-from qs3.generation.materials import MixedMaterials
-from qs3.generation.provenance import Keep, preview_of, provenance_of
-from qs3.generation.released.placement import PoseFile
-from qs3.generation.released.views import box_of_corners
+from qs3.generation.kept import Keep, preview_of, provenance_of, save_view
+from qs3.generation.materials import Light, MixedMaterials
+from qs3.generation.released import PoseFile, box_of_corners
 from qs3.generation.scenes import Alone, Surroundings
-from qs3.generation.twins import WHOLE, fused_twins, true_points, whole_surface
-from qs3.generation.view_files import save_view
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
 from qs3.meshes.mesh import Mesh
-from qs3.meshes.placement import Placing, UnitCube
+from qs3.meshes.placement import Placing, Share, UnitCube
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.seeding import object_rng
+from qs3.utils.settings import settings
 
 _BARE = Keep()
 _SPARE = 5  # times as many samples as wanted, of which regions may take all but a fifth
+
+Count = Annotated[int, Ge(1)]
+Least = Annotated[int, Ge(0)]
 
 
 class TooFewPointsError(DataError):
@@ -48,8 +49,7 @@ class Cloud:
 
     Attributes:
         arrays: [P, 3] float32 by name; "points", and "points_clean" where there is a twin;
-            where it was asked for also "provenance" [P, 5] of "points", and its twins
-            (`qs3.generation.twins`).
+            where it was asked for also "provenance" [P, 5] of "points".
         views: frames that gave points.
         valid_points: points before sampling.
         frames: the depth frames, for looking at (empty where there are none).
@@ -72,14 +72,14 @@ class Recipe(Protocol):
     def make(
         self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
-        """Make the cloud; TooFewPointsError, MeshError or RenderError say why not.
+        """Make the cloud; TooFewPointsError, MeshError or RenderError give the reason if not.
 
         `keep` asks for more than the cloud and never changes it.
         """
         ...
 
 
-@dataclass(frozen=True)
+@settings
 class BoxCrop:
     """Keep the points in the object's axis-aligned box, enlarged by a margin.
 
@@ -89,10 +89,7 @@ class BoxCrop:
     (docs/sensors/planes.csv: 6.4, 11.3 and 18.0 mm).
     """
 
-    margin_m: float = 0.03
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "crop.", margin_m=">= 0")
+    margin_m: Annotated[float, Ge(0)] = 0.03
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
         """[h, w] bool in the image; None: the box alone decides, after back-projection."""
@@ -104,7 +101,7 @@ class BoxCrop:
         return ((points >= low) & (points <= high)).all(axis=1)
 
 
-@dataclass(frozen=True)
+@settings
 class MaskCrop(BoxCrop):
     """Keep the pixels of the object's mask and box, drawn as sloppily as annotations are.
 
@@ -122,15 +119,10 @@ class MaskCrop(BoxCrop):
         margin_m: by which the object's axis-aligned box is enlarged.
     """
 
-    margin_m: float = 0.1
+    margin_m: Annotated[float, Ge(0)] = 0.1
     min_grow_px: int = -1
     max_grow_px: int = 3
-    max_shift_px: int = 2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ranges(self, "crop.", max_shift_px=">= 0")
-        check_order(self, "crop.", "grow_px")
+    max_shift_px: Least = 2
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray:
         """[h, w] bool."""
@@ -146,7 +138,62 @@ class MaskCrop(BoxCrop):
         return mask.astype(bool)
 
 
-@dataclass(frozen=True)
+@settings
+class DepthErrors:
+    """Which errors stay in a frame, to learn what the others are worth.
+
+    They come out of how a sensor forms its images, and are undone by the true depth. So scans with
+    and without them have the same views and noise, and no error is ever drawn from a mask.
+
+    Attributes:
+        holes: False: where the object is seen and nothing was measured there is its true depth.
+        mixed_pixels: False: a depth that no surface close by has, as at the edge between two, is
+            dropped. It leaves a hole, which `holes` does not fill.
+        reach_px: pixels of the camera to each side that count as close by: half a matcher's block
+            and more, as blocks make surfaces wider; 6 for a Kinect's 9, 12 for the paper's 19.
+        apart_m, apart_per_m: a depth z belongs to a surface that is nearer to it than apart_m +
+            apart_per_m z^2. By default 2 cm and a fifth of a Kinect's pixel of disparity, three
+            standard deviations of its noise.
+    """
+
+    holes: bool = True
+    mixed_pixels: bool = True
+    reach_px: Annotated[int, Ge(1)] = 6
+    apart_m: Annotated[float, Ge(0)] = 0.02
+    apart_per_m: Annotated[float, Ge(0)] = 0.005
+
+    def left_in(self, frame: DepthFrame) -> DepthFrame:
+        """The frame with the errors that stay; its reasons and pictures are what they were."""
+        depth, missing = frame.depth_m, np.isnan(frame.depth_m)
+        if not self.mixed_pixels:
+            depth = np.where(self.mixed(frame), np.float32(np.nan), depth)
+        if not self.holes:
+            depth = np.where(missing & (frame.label == 1), frame.clean_m, depth)
+        return frame if depth is frame.depth_m else replace(frame, depth_m=depth)
+
+    def mixed(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:
+        """Measured samples whose depth no true surface within `reach_px` has."""
+        steps = max(1, self.reach_px // frame.step_px)
+        close = _surface_near(frame.clean_m, frame.depth_m, steps)
+        with np.errstate(invalid="ignore"):
+            return close > self.apart_m + self.apart_per_m * frame.depth_m**2
+
+
+def _surface_near(
+    true_m: Float[np.ndarray, "h w"], depth_m: Float[np.ndarray, "h w"], steps: int
+) -> Float[np.ndarray, "h w"]:
+    """How far each depth is from the nearest of the true ones around it, m; NaN without a depth."""
+    height, width = depth_m.shape
+    near = np.where(np.isnan(depth_m), np.float32(np.nan), np.float32(np.inf))
+    around = np.pad(true_m, steps, constant_values=np.inf)
+    for row in range(2 * steps + 1):
+        for column in range(2 * steps + 1):
+            other = around[row : row + height, column : column + width]
+            near = np.fmin(near, np.abs(depth_m - other))
+    return near
+
+
+@settings
 class Mesh2Point:
     """Mesh to points through a simulated depth sensor.
 
@@ -166,27 +213,25 @@ class Mesh2Point:
             released code does, and not by the object's own axis-aligned box.
     """
 
-    sensor: DepthSensor
+    sensor: InstanceOf[DepthSensor]
     placing: Placing = field(default_factory=UnitCube)
     scene: Surroundings = field(default_factory=Alone)
     views: Views = field(default_factory=AnchoredViews)
-    drift: Drift = field(default_factory=Drift)
-    crop: BoxCrop = field(default_factory=BoxCrop)
-    points: int = 2048
-    min_points: int = 128
-    min_view_points: int = 1
+    drift: InstanceOf[Drift] = field(default_factory=Drift)
+    crop: InstanceOf[BoxCrop] = field(default_factory=BoxCrop)
+    points: Count = 2048
+    min_points: Least = 128
+    min_view_points: Least = 1
     clean: bool = True
-    min_clean_points: int | None = None
-    poses: PoseFile | None = None
-    materials: MixedMaterials | None = None
+    min_clean_points: Least | None = None
+    poses: InstanceOf[PoseFile] | None = None
+    materials: InstanceOf[MixedMaterials] | None = None
     light: Light | None = None
-    depth_errors: DepthErrors | None = None
+    depth_errors: InstanceOf[DepthErrors] | None = None
     box_of_corners: bool = False
     needs_renderer: bool = True
 
     def __post_init__(self) -> None:
-        least = dict.fromkeys(("min_points", "min_view_points", "min_clean_points"), ">= 0")
-        check_ranges(self, "recipe.", points=">= 1", **least)
         if self.poses is not None:
             object.__setattr__(self, "placing", self.poses.placing)
             object.__setattr__(self, "views", self.poses.views(self.views.count))
@@ -195,8 +240,7 @@ class Mesh2Point:
         self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
         """See Recipe.make."""
-        if renderer is None:
-            raise ConfigError("Mesh2Point needs a renderer: set renderer=mitsuba or blender")
+        assert renderer is not None
         rng = object_rng(seed, object_id, 0)
         placed = self.placing.place(mesh, rng, object_id)
         box = placed.bounds
@@ -210,7 +254,6 @@ class Mesh2Point:
         believed_poses = self.drift.believed(true_poses, pose_rng)
 
         noisy, clean, frames, origins = [], [], [], []
-        seen_by = {}
         for i, (pose, believed) in enumerate(zip(true_poses, believed_poses, strict=True)):
             view_rng = object_rng(seed, object_id, 2 + i)
             explain = keep.views is not None
@@ -228,48 +271,38 @@ class Mesh2Point:
             # A box is known in the world; with drift the cloud and the box part company,
             # as they do when a scan is cropped by an annotation made on the fused model.
             inside = self.crop.inside(points, crop_box)
-            measured, points = points, points[inside]
+            points = points[inside]
             if len(points) >= self.min_view_points:
                 noisy.append(points)
-                if keep.twins:
-                    true = true_points(frame, depth, measured, pose)[inside]
-                    seen_by[i] = (points, true)
                 if keep.provenance:
                     origins.append(provenance_of(frame, depth, i)[inside])
             if self.clean:
                 seen = np.where(frame.label == 1, frame.clean_m, np.nan)
                 clean.append(frame.points(seen, pose))
 
-        fused, order = self._sample(noisy, "the sensor", "min_points")
+        fused, order = self._sample(noisy, "min_points")
         arrays = {"points": fused[order]}
         if self.clean:
             least = "min_points" if self.min_clean_points is None else "min_clean_points"
-            true, true_order = self._sample(clean, "the true depth", least)
+            true, true_order = self._sample(clean, least)
             arrays["points_clean"] = true[true_order]
         if keep.provenance:
             arrays["provenance"] = np.concatenate(origins)[order]
-        if WHOLE in keep.twins:
-            arrays["points_whole"] = whole_surface(placed, object_id, seed, self.points)
-        if keep.twins:
-            arrays |= fused_twins(keep.twins, seen_by, self.views.count, order)
         preview = preview_of(frames[0]) if object_id in keep.previews else {}
         return Cloud(arrays, len(noisy), sum(map(len, noisy)), tuple(frames), preview)
 
-    def _sample(
-        self, parts: list[np.ndarray], what: str, least: str
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _sample(self, parts: list[np.ndarray], least: str) -> tuple[np.ndarray, np.ndarray]:
         """All points [M, 3] float32, and which of them make the cloud: [P] indices."""
         total, wanted = sum(map(len, parts)), getattr(self, least)
         if total < max(wanted, 1):
             raise TooFewPointsError(
-                f"{what} gave {total} points over {self.views.count} views, fewer than "
-                f"recipe.{least}={wanted}"
+                f"{total} points over {self.views.count} views, fewer than recipe.{least}={wanted}"
             )
         fused = np.concatenate(parts).astype(np.float32)
         return fused, farthest_point_sampling_np(fused, self.points)
 
 
-@dataclass(frozen=True)
+@settings
 class RegionDropout:
     """Holes in a surface sample, to imitate missing parts (the paper's M_d).
 
@@ -277,22 +310,14 @@ class RegionDropout:
     of the cloud, each emptying a share of the cloud. All together take four fifths at most.
     """
 
-    min_regions: int = 1
-    max_regions: int = 3
-    min_share: float = 0.1
-    max_share: float = 0.25
+    min_regions: Least = 1
+    max_regions: Least = 3
+    min_share: Share = 0.1
+    max_share: Share = 0.25
 
     def __post_init__(self) -> None:
-        prefix = "recipe.dropout."
-        for name in ("min_regions", "max_regions"):
-            check_int(f"{prefix}{name}", getattr(self, name), 0)
-        check_ranges(self, prefix, min_share="[0, 1]", max_share="[0, 1]")
-        check_order(self, prefix, "regions", "share")
-        if (taken := self.max_regions * self.max_share) > 1 - 1 / _SPARE:
-            raise ConfigError(
-                f"{prefix}max_regions={self.max_regions} times {prefix}max_share="
-                f"{self.max_share:g} is {taken:.0%} of a cloud: take at most {1 - 1 / _SPARE:.0%}"
-            )
+        if self.max_regions * self.max_share > 1 - 1 / _SPARE:  # too few points would be left
+            raise ConfigError("recipe.dropout: max_regions * max_share must be at most 0.8")
 
     def apply(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """The points [N, 3] that remain; each region takes its share of the N."""
@@ -306,17 +331,14 @@ class RegionDropout:
         return points
 
 
-@dataclass(frozen=True)
+@settings
 class SurfaceSamples:
     """Uniform samples of the whole surface, as in ModelNet10 (M) and its dropout (M_d)."""
 
     placing: Placing = field(default_factory=UnitCube)
-    dropout: RegionDropout | None = None
-    points: int = 2048
+    dropout: InstanceOf[RegionDropout] | None = None
+    points: Count = 2048
     needs_renderer: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "recipe.", points=">= 1")
 
     def make(
         self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE

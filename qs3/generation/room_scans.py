@@ -8,32 +8,31 @@ annotator draws its mask, and `qs3.datasets.cutting` cuts by the same rules as i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge, Interval
 from jaxtyping import Bool
+from pydantic import InstanceOf
 
-from qs3.config.checks import check_float, check_order, check_ranges
-from qs3.datasets.cutting import cut, inliers, own_pixels
+from qs3.datasets.cutting import cut, own_pixels
 from qs3.datasets.depth_images import DepthImage, Pinhole
 from qs3.datasets.regions import Rules, pieces
-from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
-from qs3.generation.lights import Light
-from qs3.generation.materials import MixedMaterials
-from qs3.generation.provenance import Keep, preview_of, provenance_of
-from qs3.generation.recipes import Cloud, MaskCrop, TooFewPointsError
-from qs3.generation.scenes import HAIR_M, Room, Surroundings, around_an_eye
-from qs3.generation.twins import WHOLE, fused_twins, true_points, whole_surface
-from qs3.generation.view_files import save_view
+from qs3.generation.kept import Keep, preview_of, provenance_of, save_view
+from qs3.generation.materials import Light, MixedMaterials
+from qs3.generation.recipes import Cloud, Count, MaskCrop, TooFewPointsError
+from qs3.generation.scenes import HAIR_M, Room, around_an_eye
 from qs3.geometry.cameras import Intrinsics, look_at
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.meshes.mesh import Mesh
-from qs3.meshes.placement import Placing, RealSize
+from qs3.meshes.placement import Placing, Positive, RealSize, Share
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Body, Renderer
 from qs3.utils.seeding import object_rng
+from qs3.utils.settings import settings
 
 _BARE = Keep()
 _AROUND_M = 0.3
@@ -41,7 +40,7 @@ _AROUND_M = 0.3
 _WORKTOP_M = 0.05
 
 
-@dataclass(frozen=True)
+@settings
 class RoomCamera:
     """Somebody stands in a room; the object is anywhere in the picture.
 
@@ -57,20 +56,14 @@ class RoomCamera:
 
     min_height_m: float = 1.1
     max_height_m: float = 1.7
-    min_distance_m: float = 1.3
-    max_distance_m: float = 4.5
-    clearance_m: float = 0.6
-    spread: float = 0.85
+    min_distance_m: Positive = 1.3
+    max_distance_m: Positive = 4.5
+    clearance_m: Annotated[float, Ge(0)] = 0.6
+    spread: Share = 0.85
     min_pitch_deg: float = -5.0
     max_pitch_deg: float = 40.0
-    roll_deg: float = 1.5
-    side_deg: float = 75.0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self, "recipe.camera.", clearance_m=">= 0", spread="[0, 1]", side_deg="[0, 180]"
-        )
-        check_order(self, "recipe.camera.", "height_m", "distance_m", "pitch_deg")
+    roll_deg: Annotated[float, Ge(0)] = 1.5
+    side_deg: Annotated[float, Interval(ge=0, le=180)] = 75.0
 
     def pose(
         self,
@@ -105,7 +98,7 @@ class RoomCamera:
         return pose
 
 
-@dataclass(frozen=True)
+@settings
 class RoomScan:
     """Mesh to points through one depth image of a room.
 
@@ -131,52 +124,29 @@ class RoomScan:
         views: 1, the only number of views there is.
     """
 
-    sensor: DepthSensor
+    sensor: InstanceOf[DepthSensor]
     placing: Placing = field(default_factory=RealSize)
-    scene: Surroundings = field(default_factory=Room)
-    arrangement: Arrangement | None = None
-    camera: RoomCamera = field(default_factory=RoomCamera)
-    fronts: Mapping[str, float] = field(default_factory=dict)
-    mask: MaskCrop = field(default_factory=MaskCrop)
-    rules: Rules = field(default_factory=Rules)
-    points: int = 2048
-    torn: float = 0.0
-    worktops: Mapping[str, float] = field(default_factory=dict)
-    attempts: int = 12
+    scene: InstanceOf[Room] = field(default_factory=Room)
+    arrangement: InstanceOf[Arrangement] | None = None
+    camera: InstanceOf[RoomCamera] = field(default_factory=RoomCamera)
+    fronts: Mapping[str, Share] = field(default_factory=dict)
+    mask: InstanceOf[MaskCrop] = field(default_factory=MaskCrop)
+    rules: InstanceOf[Rules] = field(default_factory=Rules)
+    points: Count = 2048
+    torn: Share = 0.0
+    worktops: Mapping[str, Share] = field(default_factory=dict)
+    attempts: Count = 12
     clean: bool = True
-    views: int = 1
-    materials: MixedMaterials | None = None
+    views: Literal[1] = 1
+    materials: InstanceOf[MixedMaterials] | None = None
     light: Light | None = None
     needs_renderer: bool = True
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "recipe.", points=">= 1", attempts=">= 1", torn="[0, 1]")
-        for name in ("fronts", "worktops"):
-            for cls, chance in getattr(self, name).items():
-                check_float(f"recipe.{name}.{cls}", chance, "[0, 1]")
-        if self.views != 1:
-            raise ConfigError(f"views={self.views}: a scan of a room is one view; leave views out")
-        if not isinstance(self.mask, MaskCrop):
-            raise ConfigError(
-                "a scan of a room is cut by a mask: leave crop out, or take crop=mask"
-            )
-        if self.mask.margin_m != MaskCrop().margin_m:
-            raise ConfigError(
-                f"crop.margin_m={self.mask.margin_m} says nothing to a scan of a room, which is "
-                "cut by its mask and not by a box: leave it out"
-            )
-        if not isinstance(self.scene, Room):
-            raise ConfigError(
-                "a scan of a room needs a room, whose floor and furniture its objects stand on: "
-                "leave scene out, or take scene=room"
-            )
 
     def make(
         self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
         """See Recipe.make."""
-        if renderer is None:
-            raise ConfigError("RoomScan needs a renderer: set renderer=mitsuba or blender")
+        assert renderer is not None
         cls = object_id.split("/")[0]
         placed = self.placing.place(mesh, object_rng(seed, object_id, 0), object_id)
         front = yaw_between(mesh, placed) - np.pi / 2
@@ -207,14 +177,8 @@ class RoomScan:
                 rules = replace(rules, join_m=0.0)
             piece = cut(image, mask, cls, rules, edge_px)
             if not piece.refused:
-                own, _, _ = own_pixels(image, mask, rules, edge_px)
-                if self.rules.drop_outliers:
-                    own[own] = inliers(image.points_m[own], self.rules)
-                cloud = self._cloud(frame, own, pose, object_id, keep)
-                if WHOLE in keep.twins:
-                    whole = whole_surface(placed, object_id, seed, self.points)
-                    cloud = replace(cloud, arrays={**cloud.arrays, "points_whole": whole})
-                return cloud
+                assert piece.own is not None
+                return self._cloud(frame, piece.own, pose, object_id, keep)
             why = piece.why
         raise TooFewPointsError(
             f"none of {self.attempts} pictures (recipe.attempts) shows it well enough; "
@@ -260,9 +224,6 @@ class RoomScan:
             arrays["points_clean"] = true[farthest_point_sampling_np(true, self.points)]
         if keep.provenance:
             arrays["provenance"] = provenance_of(frame, depth, 0)[order]
-        if keep.twins:
-            one = {0: (points, true_points(frame, depth, points, pose))}
-            arrays |= fused_twins(keep.twins, one, 1, order)
         if keep.views is not None:
             save_view(keep.views, object_id, 0, frame, pose, pose)
         preview = preview_of(frame) if object_id in keep.previews else {}

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import field
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
+from annotated_types import Ge
+from pydantic import InstanceOf
 
-from qs3.config.checks import check_int, check_order, check_ranges
-from qs3.errors import ConfigError
 from qs3.meshes.mesh import Mesh, merge
+from qs3.meshes.placement import Positive, Share
 from qs3.sensors.renderers.base import Body
+from qs3.utils.settings import settings
 
 HAIR_M = 1e-4
 """What an object stands on is so far below it: its bottom face is in no other face's plane."""
 
 
+@runtime_checkable
 class Surroundings(Protocol):
     """What stands around the object."""
 
@@ -33,7 +36,7 @@ class Surroundings(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@settings
 class Alone:
     """The object floats in the dark, as in the paper."""
 
@@ -48,7 +51,7 @@ class Alone:
         return (Body(mesh, albedo=0.8, label=1),)
 
 
-@dataclass(frozen=True)
+@settings
 class Support:
     """What an object above the floor stands on: a block, or a board on four legs.
 
@@ -61,22 +64,13 @@ class Support:
         min_leg_m, max_leg_m: of the legs.
     """
 
-    min_margin_m: float = 0.03
-    max_margin_m: float = 0.4
-    block: float = 0.4
-    min_board_m: float = 0.02
-    max_board_m: float = 0.06
-    min_leg_m: float = 0.03
-    max_leg_m: float = 0.08
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "scene.support.", block="[0, 1]")
-        for name in ("margin_m", "board_m", "leg_m"):
-            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
-            if not 0 < low <= high:
-                raise ConfigError(
-                    f"scene.support: 0 < min_{name} <= max_{name} must hold, got {low} and {high}"
-                )
+    min_margin_m: Positive = 0.03
+    max_margin_m: Positive = 0.4
+    block: Share = 0.4
+    min_board_m: Positive = 0.02
+    max_board_m: Positive = 0.06
+    min_leg_m: Positive = 0.03
+    max_leg_m: Positive = 0.08
 
     def under(self, mesh: Mesh, floor: float, rng: np.random.Generator) -> Mesh:
         """It stands on z = `floor`, its top a hair below the object's lowest point."""
@@ -94,7 +88,7 @@ class Support:
         return table((low, high), turn, floor, top, board, leg)
 
 
-@dataclass(frozen=True)
+@settings
 class Room:
     """The object stands on a floor, maybe before a wall, among boxes and cylinders.
 
@@ -111,25 +105,17 @@ class Room:
         support: what an object stands on that is above the floor.
     """
 
-    wall: float = 0.5
-    max_clutter: int = 5
-    max_occluders: int = 2
-    clutter_m: float = 0.5
-    occluder_m: float = 0.3
-    max_between: int = 0
-    between_m: float = 1.0
-    between_height_m: float = 0.8
-    min_albedo: float = 0.25
-    max_albedo: float = 0.9
-    support: Support = field(default_factory=Support)
-
-    def __post_init__(self) -> None:
-        for name in ("max_clutter", "max_occluders", "max_between"):
-            check_int(f"scene.{name}", getattr(self, name), 0)
-        sizes = dict.fromkeys(("clutter_m", "occluder_m", "between_m", "between_height_m"), "> 0")
-        shares = dict.fromkeys(("wall", "min_albedo", "max_albedo"), "[0, 1]")
-        check_ranges(self, "scene.", **sizes, **shares)
-        check_order(self, "scene.", "albedo")
+    wall: Share = 0.5
+    max_clutter: Annotated[int, Ge(0)] = 5
+    max_occluders: Annotated[int, Ge(0)] = 2
+    clutter_m: Positive = 0.5
+    occluder_m: Positive = 0.3
+    max_between: Annotated[int, Ge(0)] = 0
+    between_m: Positive = 1.0
+    between_height_m: Positive = 0.8
+    min_albedo: Share = 0.25
+    max_albedo: Share = 0.9
+    support: InstanceOf[Support] = field(default_factory=Support)
 
     def bodies(
         self,

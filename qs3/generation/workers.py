@@ -1,38 +1,46 @@
-"""Many objects, several processes: a recipe run over meshes.
+"""Many objects, several processes: a recipe run over meshes, here or on other machines.
 
 Each worker process makes its renderer once (Blender and Mitsuba are one a process) and is
 replaced after a few hundred objects, because their memory creeps. An object that kills its
-worker each time is reported as failed.
+worker each time is reported as failed. What became of an object is saved as a part of the
+unfinished dataset (`qs3.store.parts`), by the worker where it can.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
+import platform
 import resource
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
 
-from qs3.errors import MeshMemoryError, MeshUnavailableError, Qs3Error, RenderError
-from qs3.generation.materials import MixedMaterials
-from qs3.generation.provenance import Keep
+from qs3.errors import ConfigError, MeshError, MeshUnavailableError, Qs3Error, RenderError
+from qs3.generation.kept import DiskError, Keep
+from qs3.generation.plan import code_fingerprint
 from qs3.generation.recipes import Cloud, Recipe
-from qs3.generation.travel import check_software, sent, software
-from qs3.generation.view_files import DiskError, disk_errors_travel
-from qs3.meshes.mesh import Mesh
-from qs3.meshes.source import MeshItem
+from qs3.meshes.io import load_mesh
+from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.sensors.renderers.base import Renderer
+from qs3.store.parts import PartFiles
 from qs3.utils.pool import Pool, Processes
 
 log = logging.getLogger(__name__)
 
 COLLIDERS = "colliders left out"
 """Begins the note of an object that had some."""
-_DEATHS = 3  # objects in a row
 DIED = "the worker process died on this object each time (out of memory, or a crash)"
+_DEATHS = 3  # objects in a row
+_PREVIEW = "preview_"
+_LIBRARIES = ("numpy", "opencv-python-headless", "fpsample", "mitsuba", "drjit", "bpy", "trimesh")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +55,7 @@ class Outcome:
         lasting: whether it would fail again: the object is to blame, and not the machine or a
             defect of ours. Other failures are tried again at the next start.
         unavailable: its mesh is there no more: the dataset is not finished without it.
-        note: what else its manifest row should say of an object that did not fail.
+        note: what else its manifest row should state of an object that did not fail.
         saved: the worker has saved it (`Job.save`); then `cloud` is None here.
         seconds: that the scan took.
         memory_mb: the most that its process had taken by then.
@@ -90,11 +98,7 @@ class Job:
 
 
 def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
-    """Make one object's cloud; failures of the object become an Outcome, not an error.
-
-    Raises:
-        DiskError: the views cannot be written; it would be the same with every object.
-    """
+    """Make one object's cloud; failures of the object become an Outcome, not an error."""
     begin = time.perf_counter()
     outcome = _scan(job, renderer, item)
     seconds = time.perf_counter() - begin
@@ -110,45 +114,65 @@ def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
         mesh = item.load()
         sha256 = mesh.sha256
         cloud = job.recipe.make(mesh, item.id, job.seed, renderer, job.keep)
-        return Outcome(item.id, sha256, replace(cloud, frames=()), "", note=_note(job, mesh))
+        note = f"{COLLIDERS}: {mesh.colliders}" if mesh.colliders else ""
+        return Outcome(item.id, sha256, replace(cloud, frames=()), "", note=note)
     except DiskError:
         raise
     except MeshUnavailableError as error:  # it was there when its content was hashed
         reason, lasting, unavailable = str(error), False, True
-    except MeshMemoryError as error:
-        reason, lasting = str(error), False
     except Qs3Error as error:
         reason = str(error)
-    except MemoryError:
-        reason, lasting = "out of memory", False
     except Exception as error:  # one odd mesh must not stop thousands
         log.exception("%s: unexpected error", item.id)
         reason, lasting = f"unexpected {type(error).__name__}: {error}", False
     return Outcome(item.id, sha256, None, reason, lasting, unavailable)
 
 
-def _note(job: Job, mesh: Mesh) -> str:
-    """What a manifest should say of an object that was made."""
-    notes = [f"{COLLIDERS}: {mesh.colliders}"] * bool(mesh.colliders)
-    materials: MixedMaterials | None = getattr(job.recipe, "materials", None)
-    notes += [materials.note(mesh)] if materials is not None else []
-    return "; ".join(filter(None, notes))
+def save_part(parts: PartFiles, outcome: Outcome) -> None:
+    """Write one outcome, atomically."""
+    cloud = outcome.cloud
+    note = {
+        **{key: getattr(outcome, key) for key in ("item_id", "mesh_sha256", "reason", "note")},
+        **{"seconds": outcome.seconds, "memory_mb": outcome.memory_mb},
+        **{
+            "views": cloud.views if cloud else 0,
+            "valid_points": cloud.valid_points if cloud else 0,
+        },
+    }
+    arrays = dict(cloud.arrays) if cloud else {}
+    if cloud:
+        arrays |= {_PREVIEW + name: image for name, image in cloud.preview.items()}
+    parts.write(_name(outcome.item_id), note, arrays)
+
+
+def load_part(parts: PartFiles, item_id: str) -> Outcome:
+    """One outcome; its arrays stay on disk until they are asked for."""
+    note, found = parts.open(_name(item_id))
+    seen = [name for name in found if name.startswith(_PREVIEW)]
+    arrays = found.only([name for name in found if name not in seen])
+    preview = {name.removeprefix(_PREVIEW): found[name] for name in seen}
+    views, points = note.pop("views"), note.pop("valid_points")
+    cloud = Cloud(arrays, views, points, preview=preview) if arrays else None
+    return Outcome(cloud=cloud, **note)
+
+
+def has_part(parts: PartFiles, item_id: str) -> bool:
+    """Whether an outcome is saved."""
+    return parts.has(_name(item_id))
+
+
+def _name(item_id: str) -> str:
+    """Of a part's file: ids are longer than names of files may be."""
+    return hashlib.sha256(item_id.encode()).hexdigest()[:32]
 
 
 def renderer_provenance(job: Job) -> dict[str, str]:
-    """Renderer, variant and versions, asked in a child process.
-
-    Raises:
-        RenderError: the renderer cannot be used here.
-    """
+    """Renderer, variant and versions, asked in a child process."""
     if not job.recipe.needs_renderer:
         return {}
     (outcome,) = Processes(1).run(partial(_Inspector, job), [("renderer", None)])
     if outcome.result is None:
-        raise RenderError(
-            "the renderer's process died at its start (out of memory, killed, or a library that "
-            "does not fit): run again, and see `qs3 doctor` if it happens again"
-        )
+        raise RenderError("the renderer's process died at its start: see `qs3 doctor`")
     provenance, found_out = outcome.result
     # What the child found out about this machine need not be found out by every worker.
     os.environ.update(found_out)
@@ -161,16 +185,11 @@ def scan_all(job: Job, items: list[MeshItem], pool: Pool) -> Iterator[Outcome]:
     Args:
         job: what to do.
         items: with which meshes.
-        pool: who does it.
-
-    Raises:
-        RenderError: one object after the other kills its worker, it is not the objects; or a
-            machine of the pool would make other clouds.
-        ConfigError: meshes or views cannot be sent between machines without a disk in common.
+        pool: the processes that do it, here or elsewhere.
     """
     deaths = 0
     if not pool.shared_disk:
-        items = sent(items, keep_views=job.keep.views is not None)
+        items = _sent(items, keep_views=job.keep.views is not None)
     make_worker = partial(_Scanner, job, saves=pool.shared_disk and pool.at_once > 0)
     tasks = ((item.id, item) for item in items)
     for outcome in pool.run(make_worker, tasks):
@@ -201,15 +220,14 @@ class _Scanner:
         outcome = scan_one(self.job, self.renderer, item)
         if self.save is None or not outcome.lasting:
             return outcome
-        with disk_errors_travel():
-            if self.job.check_place:
-                self.job.check_place()
-            self.save(outcome)
+        if self.job.check_place:
+            self.job.check_place()
+        self.save(outcome)
         return replace(outcome, cloud=None, saved=True)
 
 
 class _Inspector:
-    """A worker that says which renderer it has, and what it has learnt about the machine."""
+    """A worker that tells which renderer it has, and what it found out about the machine."""
 
     def __init__(self, job: Job) -> None:
         self.renderer = job.make_renderer()
@@ -217,3 +235,63 @@ class _Inspector:
     def __call__(self, _: None) -> tuple[dict[str, str], dict[str, str]]:
         found_out = {name: value for name, value in os.environ.items() if name.startswith("QS3_")}
         return self.renderer.provenance(), found_out
+
+
+def software() -> dict[str, str]:
+    """What decides the bytes of a cloud beside the renderer, of this machine."""
+    return {
+        **{name: version(name) for name in _LIBRARIES},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "qs3's code": code_fingerprint()[:12],
+    }
+
+
+def check_software(expected: Mapping[str, str], found: Mapping[str, str]) -> None:
+    """Raise RenderError on a machine whose clouds would be others.
+
+    Args:
+        expected: of the machine that the command was given on.
+        found: of this one.
+    """
+    names = sorted({*expected, *found})
+    if differs := [name for name in names if found.get(name) != expected.get(name)]:
+        pairs = ", ".join(f"{name} ({found.get(name)}, {expected.get(name)})" for name in differs)
+        raise RenderError(
+            f"{platform.node()} would make other clouds than the machine of the command: {pairs}"
+        )
+
+
+def _sent(items: Sequence[MeshItem], keep_views: bool) -> list[MeshItem]:
+    """Items that take the bytes of their files along, for machines that do not see the files."""
+    if keep_views or any(item.path and item.path.suffix.lower() == ".gltf" for item in items):
+        raise ConfigError(
+            "keep_views=true, and meshes in several files (.gltf), need a disk that all nodes see: "
+            "engine.shared_disk=true"
+        )
+    return [replace(item, load=_Sent(item)) if item.path else item for item in items]
+
+
+class _Sent:
+    """Loads a mesh wherever it is called; what is pickled holds the file's content."""
+
+    def __init__(self, item: MeshItem) -> None:
+        assert item.path is not None
+        assert isinstance(item.load, partial)
+        self.path, self.settings = item.path, item.load.keywords
+        self.content: bytes | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Read when it is sent, not before: there may be many."""
+        return {**self.__dict__, "content": self.path.read_bytes()}
+
+    def __call__(self) -> Mesh:
+        if self.content is None:
+            return load_mesh(self.path, **self.settings)
+        with tempfile.TemporaryDirectory(prefix="qs3-mesh-") as folder:
+            copy = Path(folder) / self.path.name
+            copy.write_bytes(self.content)
+            try:
+                return load_mesh(copy, **self.settings)
+            except MeshError as error:  # a manifest is the same wherever objects were scanned
+                raise MeshError(str(error).replace(folder, str(self.path.parent))) from error

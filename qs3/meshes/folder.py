@@ -19,80 +19,53 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal
 
-from qs3.classes import ALIASES, CLASSES, known_as
-from qs3.config.checks import check_choice, check_float
+from annotated_types import Gt, Lt
+
+from qs3.classes import CLASSES, known_as
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.meshes.io import SUFFIXES, load_mesh
-from qs3.meshes.source import MeshItem
+from qs3.meshes.io import SUFFIXES, Up, load_mesh
+from qs3.meshes.mesh import MeshItem
+from qs3.utils.settings import settings
 
 SPLITS = ("train", "test")
 SPLIT_FOLDERS = {
     **{"train": "train", "test": "test"},
     **dict.fromkeys(("val", "valid", "validation"), "train"),
 }
-HALVES = ("all", "first", "second")
 LAYOUTS = "expected class/train/name.off with class/test/name.off, or class/name.off"
-UNREAD = (
-    *(".step", ".stp", ".iges", ".igs", ".sldprt", ".skp", ".blend", ".fbx", ".3ds", ".wrl"),
-    *(".x3d", ".usd", ".usda", ".usdc", ".usdz"),
-)
-"""Suffixes of other formats of shapes, which somebody may think are read."""
 
 
-@dataclass(frozen=True)
+@settings
 class MeshFolder:
     """The meshes below one folder, with their classes and splits.
 
     Attributes:
         path: the root; its sub-folders are classes.
-        classes: the wanted ones; None: all known. A wanted one that is not there is an error,
-            which names the folders that are not classes: it may be misspelt.
+        classes: the wanted ones; None: all known. A wanted one that is not there is an error.
         test_fraction: of the meshes of a class whose folder has no splits, the part for test.
         half: "all", or "first" or "second": two disjoint halves of every class and split, so
             that a source and a target domain made from one folder share no shape.
-        skip: stems of files to leave out, as if they were not there.
         known: the classes of the dataset, in label order.
-        keep_colliders, up, materials: as `load_mesh`.
+        keep_colliders, up: as `load_mesh`.
         optional: classes that need not be there: their objects come from elsewhere. One class at
             least must be.
     """
 
     path: Path
     classes: tuple[str, ...] | None = None
-    test_fraction: float = 0.2
-    half: str = "all"
-    skip: tuple[str, ...] = ()
+    test_fraction: Annotated[float, Gt(0), Lt(1)] = 0.2
+    half: Literal["all", "first", "second"] = "all"
     known: tuple[str, ...] = CLASSES
     keep_colliders: bool = False
-    up: str = "z"
+    up: Up = "z"
     optional: tuple[str, ...] = ()
-    materials: bool = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "path", Path(self.path))
-        if isinstance(self.skip, str):
-            raise ConfigError(f"skip must be a list of file stems, got the text {self.skip!r}")
-        object.__setattr__(self, "skip", tuple(self.skip))
-        if self.classes is not None:
-            object.__setattr__(self, "classes", tuple(self.classes))
-            unknown = [name for name in self.classes if name not in self.known]
-            if unknown or not self.classes:
-                raise ConfigError(f"classes must be among {', '.join(self.known)}; got {unknown}")
-        check_float("test_fraction", self.test_fraction, "(0, 1)")
-        check_choice("half", self.half, HALVES)
 
     def items(self) -> list[MeshItem]:
-        """The meshes, sorted by class, split and stem; no file is opened.
-
-        Raises:
-            MissingDataError: the root, or a wanted class, is not there or has no mesh.
-            ConfigError: a folder or file cannot be assigned to a class and split.
-            DataError: a link leads out of the root.
-        """
+        """The meshes, sorted by class, split and stem; no file is opened."""
         folders = self._class_folders()
         found: list[MeshItem] = []
         for cls in (name for name in self.known if name in folders):
@@ -103,9 +76,9 @@ class MeshFolder:
                 for stem, file in self._keep(cls, groups[split])
             ]
             if not chosen and cls not in self.optional:
-                raise ConfigError(
-                    f"no mesh of class {cls!r} in {self.path} is left with half={self.half} and "
-                    f"{len(self.skip)} to skip: add some, or leave it out with classes=[...]"
+                raise MissingDataError(
+                    f"class {cls!r} has no mesh in {self.path} with half={self.half} ({LAYOUTS}, "
+                    f"as {', '.join(SUFFIXES)}); leave it out with classes=[...]"
                 )
             found.extend(chosen)
         return found
@@ -120,17 +93,6 @@ class MeshFolder:
             and _mesh_below(entry)
         ]
 
-    def unread(self) -> list[str]:
-        """Files of the formats of `UNREAD` in folders of wanted classes; sorted."""
-        return sorted(
-            self._origin(Path(parent, name))
-            for folders in self._class_folders().values()
-            for folder in folders
-            for parent, _, names in os.walk(folder)
-            for name in names
-            if Path(name).suffix.lower() in UNREAD
-        )
-
     @property
     def _wanted(self) -> tuple[str, ...]:
         return self.classes or self.known
@@ -143,76 +105,34 @@ class MeshFolder:
         for entry in _visible(self.path):
             cls = known_as(entry.name, self.known)
             if entry.is_dir() and cls in self._wanted:
-                self._refuse_link_outside(entry)
+                self._check_link(entry)
                 folders.setdefault(cls, []).append(entry)
         missing = [name for name in self._wanted if name not in folders]
         if not folders or not set(missing) <= set(self.optional):
-            if not folders and (below := self._below()):
-                raise MissingDataError(
-                    f"the folders of classes are not in {self.path}, but in {below}: give that one"
-                )
-            there = [name for name in self.known if name in folders]
-            rest = f"add them, or leave them out with classes=[{','.join(there)}]"
-            others = ", ".join(map(repr, self.left_alone()))
             raise MissingDataError(
-                f"{self.path} has no folder of {', '.join(missing)}: "
-                + (rest if there else self._other_layout() or LAYOUTS)
-                + f". Its folders of other names: {others}; known names are "
-                f"{', '.join((*self.known, *self._aliases()))}" * bool(others)
+                f"{self.path} has no folder of {', '.join(missing)} ({LAYOUTS}); folders of other "
+                f"names: {', '.join(self.left_alone()) or 'none'}"
             )
         return folders
 
-    def _aliases(self) -> list[str]:
-        return [name for name, cls in ALIASES.items() if cls in self.known]
-
-    def _other_layout(self) -> str:
-        """What to do where the meshes lie in a layout that people have and that is not read."""
-        entries = _visible(self.path)
-        if flat := next((e for e in entries if e.suffix.lower() in SUFFIXES and e.is_file()), None):
-            return f"{flat.name} lies right in it; put meshes into a folder named after their class"
-        for split in entries:
-            if split.is_dir() and split.name.lower() in SPLIT_FOLDERS:
-                for cls in _folders_in(split):
-                    if known_as(cls, self.known):
-                        where = f"{split.name}/{cls} to {cls}/{split.name}"
-                        return f"the class comes first; move {where}"
-        return ""
-
-    def _below(self) -> Path | None:
-        """The one folder in the root with folders of wanted classes, as archives unpack."""
-        found = [
-            folder
-            for folder in _visible(self.path)
-            if folder.is_dir()
-            and not folder.is_symlink()
-            and any(known_as(name, self.known) in self._wanted for name in _folders_in(folder))
-        ]
-        return found[0] if len(found) == 1 else None
-
     def _groups(self, cls: str, folders: Sequence[Path]) -> dict[str, dict[str, Path]]:
-        """Split -> stem -> file of one class, `skip` applied."""
+        """Split -> stem -> file of one class."""
         given: dict[str, list[Path]] = {split: [] for split in SPLITS}
         loose: list[Path] = []
         for folder in folders:
             loose += self._mesh_files(folder, allowed=tuple(SPLIT_FOLDERS))
             for entry in _visible(folder):
                 if entry.is_dir() and entry.name.lower() in SPLIT_FOLDERS:
-                    self._refuse_link_outside(entry)
+                    self._check_link(entry)
                     given[SPLIT_FOLDERS[entry.name.lower()]] += self._mesh_files(entry)
         if loose and any(given.values()):
-            split_file = next(file for files in given.values() for file in files)
             raise ConfigError(
-                f"class {cls!r} in {self.path} mixes two layouts: {self._origin(loose[0])} and "
-                f"{self._origin(split_file)}. Move all files into train and test, or none"
-            )
-        if not loose and not any(given.values()) and cls not in self.optional:
-            raise MissingDataError(
-                f"class {cls!r} has no mesh in {self.path} ({LAYOUTS}, as {', '.join(SUFFIXES)}). "
-                "Add some, or leave it out with classes=[...]"
+                f"class {cls!r} in {self.path} mixes two layouts, such as {loose[0]}: move all "
+                "files into train and test, or none"
             )
         if loose:
-            return self._split(cls, self._by_stem(cls, loose))
-        return {split: self._by_stem(cls, given[split]) for split in SPLITS}
+            return self._split(cls, self._by_stem(loose))
+        return {split: self._by_stem(given[split]) for split in SPLITS}
 
     def _mesh_files(self, folder: Path, allowed: tuple[str, ...] = ()) -> list[Path]:
         """Mesh files right in `folder`; meshes in sub-folders that are not `allowed` raise."""
@@ -224,27 +144,15 @@ class MeshFolder:
                         f"{mesh} lies in a folder that is neither a class nor a split: {LAYOUTS}"
                     )
             elif entry.suffix.lower() in SUFFIXES:
-                self._refuse_link_outside(entry)
-                if not entry.name.isprintable():  # names go into manifests and messages
-                    raise ConfigError(
-                        f"{str(entry)!r} has unprintable characters in its name: rename it"
-                    )
-                if entry.is_file():
-                    files.append(entry)
+                self._check_link(entry)
+                files.append(entry)
         return files
 
-    def _by_stem(self, cls: str, files: Sequence[Path]) -> dict[str, Path]:
+    def _by_stem(self, files: Sequence[Path]) -> dict[str, Path]:
         stems: dict[str, Path] = {}
         for file in files:
-            if file.stem in self.skip:
-                continue
-            if file.stem in stems:
-                raise ConfigError(
-                    f"class {cls!r} has two files for one object: "
-                    f"{self._origin(stems[file.stem])} and {self._origin(file)}. "
-                    "Remove or rename one of them"
-                )
-            stems[file.stem] = file
+            if stems.setdefault(file.stem, file) != file:
+                raise ConfigError(f"{stems[file.stem]} and {file} are two files for one object")
         return stems
 
     def _split(self, cls: str, files: dict[str, Path]) -> dict[str, dict[str, Path]]:
@@ -265,35 +173,15 @@ class MeshFolder:
         return [(stem, files[stem]) for stem in sorted(stems)]
 
     def _item(self, cls: str, split: str, stem: str, file: Path) -> MeshItem:
-        return MeshItem(
-            id=f"{cls}/{split}/{stem}",
-            cls=cls,
-            split=split,
-            load=partial(
-                load_mesh,
-                file,
-                keep_colliders=self.keep_colliders,
-                up=self.up,
-                materials=self.materials,
-            ),
-            origin=self._origin(file),
-            path=file,
-        )
+        load = partial(load_mesh, file, keep_colliders=self.keep_colliders, up=self.up)
+        origin = file.relative_to(self.path).as_posix()
+        return MeshItem(f"{cls}/{split}/{stem}", cls, split, load, origin, file)
 
-    def _origin(self, file: Path) -> str:
-        return file.relative_to(self.path).as_posix()
-
-    def _refuse_link_outside(self, entry: Path) -> None:
-        if not entry.is_symlink():
-            return
-        try:
-            target = entry.resolve(strict=True)
-        except (OSError, RuntimeError) as error:
-            raise DataError(f"{entry} is a broken link: remove or repair it") from error
-        if not target.is_relative_to(self.path.resolve()):
+    def _check_link(self, entry: Path) -> None:
+        """Raise DataError for a link out of the root, which another machine would not follow."""
+        if entry.is_symlink() and not entry.resolve().is_relative_to(self.path.resolve()):
             raise DataError(
-                f"{entry} is a link that leads out of {self.path}, to {target}: links outside "
-                "are not followed; put the file itself there"
+                f"{entry} is a link that leads out of {self.path}, to {entry.resolve()}"
             )
 
 
@@ -303,11 +191,6 @@ def _visible(folder: Path) -> list[Path]:
         for entry in sorted(folder.iterdir())
         if not entry.name.startswith(".") and entry.name != "__MACOSX"
     ]
-
-
-def _folders_in(folder: Path) -> list[str]:
-    """Their names; of a folder that cannot be read none."""
-    return next(os.walk(folder), ("", [], []))[1]
 
 
 def _mesh_below(folder: Path) -> Path | None:

@@ -1,20 +1,22 @@
-"""A triangle mesh: the one form in which shapes travel through qs3."""
+"""A triangle mesh, the one form in which shapes travel through qs3, and where it comes from."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.finishes import Finishes
-from qs3.meshes.formats.arrays import without_strays
-from qs3.meshes.formats.colliders import Colliders
 
 if TYPE_CHECKING:
     import trimesh
+
+Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,31 +27,22 @@ class Mesh:
         vertices: [V, 3] float64.
         faces: [F, 3] int32, indices into `vertices`; orientation is not relied upon.
         colliders: invisible nodes of its file or scene that were left out.
-        finishes: what its file says its faces are made of; None: nothing, or it was not asked.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colliders: int = 0
-    finishes: Finishes | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
         faces = np.ascontiguousarray(self.faces, dtype=np.int32)
-        if vertices.ndim != 2 or vertices.shape[1] != 3:
-            raise MeshError(f"vertices have shape {vertices.shape}, expected [V, 3]")
-        if faces.ndim != 2 or faces.shape[1] != 3:
-            raise MeshError(f"faces have shape {faces.shape}, expected [F, 3] triangles")
+        assert vertices.shape[1:] == faces.shape[1:] == (3,)
         if len(faces) == 0:
             raise MeshError("the mesh has no faces")
         if not np.isfinite(vertices).all():
-            bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-            raise MeshError(f"vertex {bad} is not finite")
+            raise MeshError("a vertex is not finite")
         if faces.min() < 0 or faces.max() >= len(vertices):
-            wrong = int(faces.min() if faces.min() < 0 else faces.max())
-            raise MeshError(f"a face refers to vertex {wrong}, but there are {len(vertices)}")
-        if self.finishes is not None and len(self.finishes.of_face) != len(faces):
-            raise MeshError(f"has materials of {len(self.finishes.of_face)} of {len(faces)} faces")
+            raise MeshError(f"a face refers to a vertex that is not among the {len(vertices)}")
         vertices, faces = vertices.view(), faces.view()  # the caller's stay as they are
         vertices.flags.writeable = False
         faces.flags.writeable = False
@@ -68,9 +61,6 @@ class Mesh:
         Args:
             solid: a mesh, whatever its name, or a scene.
             keep_colliders: as `qs3.meshes.io.load_mesh`.
-
-        Raises:
-            MeshError: it has no triangles, or is neither of the two.
         """
         import trimesh
 
@@ -80,11 +70,9 @@ class Mesh:
             solids = [part for part in solid.dump() if isinstance(part, trimesh.Trimesh)]
             seen = [part for part in solids if part.metadata["node"] not in hidden]
             parts = [cls.from_trimesh(part) for part in seen if len(part.faces)]
-            if colliders.count and not parts:
+            if not parts:
                 raise MeshError(f"has no faces{colliders.exception}")
             return replace(merge(parts), colliders=colliders.count)
-        if not isinstance(solid, trimesh.Trimesh):
-            raise MeshError(f"expected a trimesh.Trimesh or Scene, got {type(solid).__name__}")
         return cls(*without_strays(np.array(solid.vertices), np.array(solid.faces)))
 
     def to_trimesh(self) -> trimesh.Trimesh:
@@ -112,16 +100,114 @@ class Mesh:
         return self.at(self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
 
     def at(self, vertices: np.ndarray) -> Mesh:
-        """The same faces and materials with other vertices [V, 3]."""
+        """The same faces with other vertices [V, 3]."""
         return replace(self, vertices=vertices)
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
     """One mesh from several, parts kept apart (no vertex is shared between them)."""
-    if not meshes:
-        raise MeshError("nothing to merge: the list of meshes is empty")
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     vertices = np.concatenate([m.vertices for m in meshes])
     faces = np.concatenate([m.faces + o for m, o in zip(meshes, offsets, strict=True)])
-    finishes = Finishes.joined([(m.finishes, len(m.faces)) for m in meshes])
-    return Mesh(vertices, faces, finishes=finishes)
+    return Mesh(vertices, faces)
+
+
+def used_part(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Only the vertices that `faces` [F, 3] use, in their order: parts often share one list."""
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise MeshError(f"has a face with a vertex that is not among {len(vertices)}")
+    used, flat = np.unique(faces, return_inverse=True)
+    return vertices[used].astype(np.float64), flat.reshape(-1, 3)
+
+
+def without_strays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same without vertices that no face uses; the same arrays where there are none.
+
+    Modelling programs leave some behind. Nobody sees them, but furniture is as large, and shadow
+    rays begin as far away, as all vertices say. Where one is not finite the file is damaged, which
+    `Mesh` finds: then none is left out.
+    """
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    whole = used.all() or not np.isfinite(vertices).all()
+    return (vertices, faces) if whole else used_part(vertices, faces)
+
+
+@dataclass(frozen=True)
+class MeshItem:
+    """One object to scan, of the embedded catalogue or of a user's folder.
+
+    Attributes:
+        id: unique in its source, e.g. "chair/train/chair_0007"; decides the object's seed.
+        cls: class name.
+        split: "train" or "test".
+        load: makes or reads the mesh; raises MeshError with the reason. Picklable.
+        origin: what the user would look for: a file name or a family of the catalogue.
+        path: the file it is read from; None if it is made.
+    """
+
+    id: str
+    cls: str
+    split: str
+    load: Callable[[], Mesh]
+    origin: str
+    path: Path | None = None
+
+
+_COLLIDER = re.compile(
+    r"^(UCX|UBX|UCP|USP|MCDCX)_"
+    r"|(^|[_\-. ])(colliders?|collisions?)([_\-. ]?\d+)*$"
+    r"|-(conv)?colonly([_\-. ]?\d+)*$",
+    re.IGNORECASE,
+)
+
+
+@dataclass
+class Colliders:
+    """Nodes of a scene that stand for collisions and that nobody sees: left out, and counted.
+
+    A game engine's invisible hulls come along in its exports. Scanned as if they were furniture,
+    they fill the legs of a chair. Known by the name of the node or of its mesh, in any case:
+
+    - `chair_collider`, `chair_collision`, also with a number behind: what exporters write;
+    - UCX_, UBX_, UCP_, USP_ and MCDCX_ before the name: Unreal Engine's static mesh pipeline;
+    - `-colonly` and `-convcolonly` behind it: Godot (its `-col` keeps the mesh visible).
+
+    Attributes:
+        skip: False leaves none out.
+        count: nodes left out so far.
+        notes: what else a reader left out, for `load_mesh` to log.
+    """
+
+    skip: bool = True
+    count: int = 0
+    notes: list[str] = field(default_factory=list)
+
+    def left_out(self, *names: str | None) -> bool:
+        """Whether a node with one of these names is left out; if so, it is counted."""
+        found = self.skip and any(_COLLIDER.search(str(name)) for name in names if name)
+        self.count += found
+        return found
+
+    def left_out_of(self, scene: trimesh.Scene) -> set[Hashable]:
+        """Nodes of trimesh's scene whose geometry is left out: colliders, and all below them.
+
+        As in files: a node below another one that is left out is not counted again, and a mesh
+        with such a name hides the node's own geometry only.
+        """
+        forest, hidden = scene.graph.transforms, set()
+        waiting = [node for node in forest.nodes if node not in forest.parents]
+        while waiting:
+            node = waiting.pop()
+            if self.left_out(str(node)):
+                hidden |= forest.successors(node)
+                continue
+            if self.left_out(forest.node_data[node].get("geometry")):
+                hidden.add(node)
+            waiting += forest.children.get(node, ())
+        return hidden
+
+    @property
+    def exception(self) -> str:
+        """What follows "has no faces" where colliders were left out."""
+        return f" but those of {self.count} colliders (colliders=keep)" if self.count else ""

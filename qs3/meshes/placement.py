@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
+from annotated_types import Gt, Interval
 
-from qs3.config.checks import check_float, check_order, check_ranges
-from qs3.errors import ConfigError, MeshError
+from qs3.errors import MeshError
 from qs3.meshes.mesh import Mesh
+from qs3.utils.settings import settings
+
+Positive = Annotated[float, Gt(0)]
+Share = Annotated[float, Interval(ge=0, le=1)]
 
 
+@runtime_checkable
 class Placing(Protocol):
     """Puts a mesh into the world."""
 
@@ -21,7 +26,7 @@ class Placing(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@settings
 class UnitCube:
     """The paper's placing: largest side 1 m, box centred on the origin, random yaw.
 
@@ -34,10 +39,10 @@ class UnitCube:
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A scaled, centred and turned copy."""
         yaw_rad = _yaw_rad(rng)  # drawn in any case: what else is drawn does not depend on it
-        return _place(mesh, 1 / _largest_side(mesh), False, yaw_rad if self.yaw else 0.0)
+        return _place(mesh, 1 / largest_side(mesh), False, yaw_rad if self.yaw else 0.0)
 
 
-@dataclass(frozen=True)
+@settings
 class RealSize:
     """The object keeps its size and stands on z = 0 with a random yaw.
 
@@ -45,28 +50,21 @@ class RealSize:
     metres (ModelNet's are not); they are scaled to `fallback_side_m`.
     """
 
-    min_side_m: float = 0.15
-    max_side_m: float = 4.0
-    fallback_side_m: float = 1.0
+    min_side_m: Positive = 0.15
+    max_side_m: Positive = 4.0
+    fallback_side_m: Positive = 1.0
 
-    def __post_init__(self) -> None:
-        sides = ("min_side_m", "max_side_m", "fallback_side_m")
-        check_ranges(self, "recipe.placing.", **dict.fromkeys(sides, "> 0"))
-        check_order(self, "recipe.placing.", "side_m")
-
-    def keeps(self, side: float) -> bool:
-        """Whether this is the largest side of a mesh in metres."""
-        return self.min_side_m <= side <= self.max_side_m
+    def keeps(self, mesh: Mesh) -> bool:
+        """Whether a mesh is in metres, by its largest side."""
+        return self.min_side_m <= largest_side(mesh) <= self.max_side_m
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A turned copy on the floor."""
-        side = _largest_side(mesh)
-        return _place(
-            mesh, 1.0 if self.keeps(side) else self.fallback_side_m / side, True, _yaw_rad(rng)
-        )
+        scale = 1.0 if self.keeps(mesh) else self.fallback_side_m / largest_side(mesh)
+        return _place(mesh, scale, True, _yaw_rad(rng))
 
 
-@dataclass(frozen=True)
+@settings
 class OnFurniture(RealSize):
     """As `RealSize`, and things of some classes stand on furniture: above the floor, z = 0.
 
@@ -78,23 +76,9 @@ class OnFurniture(RealSize):
         tallest_m: taller ones always do, as floor lamps and trees.
     """
 
-    stands_m: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    raised: Mapping[str, float] = field(default_factory=dict)
-    tallest_m: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ranges(self, "recipe.placing.", tallest_m="> 0")
-        for cls, chance in self.raised.items():
-            check_float(f"recipe.placing.raised.{cls}", chance, "[0, 1]")
-            if cls not in self.stands_m:
-                raise ConfigError(f"recipe.placing.raised.{cls}: on what? Give stands_m.{cls}, too")
-        for cls, ends in self.stands_m.items():
-            if len(ends) != 2 or not 0 < ends[0] <= ends[1]:
-                raise ConfigError(
-                    f"recipe.placing.stands_m.{cls}={list(ends)}: expected [lowest, highest] in "
-                    "metres, 0 < lowest <= highest"
-                )
+    stands_m: Mapping[str, tuple[Positive, Positive]] = field(default_factory=dict)
+    raised: Mapping[str, Share] = field(default_factory=dict)
+    tallest_m: Positive = 1.0
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A turned copy on the floor or above it."""
@@ -108,16 +92,17 @@ class OnFurniture(RealSize):
         return placed.at(placed.vertices + np.array([0, 0, low + (high - low) * height]))
 
 
-def _yaw_rad(rng: np.random.Generator) -> float:
-    return rng.uniform(0, 2 * np.pi)
-
-
-def _largest_side(mesh: Mesh) -> float:
+def largest_side(mesh: Mesh) -> float:
+    """Of its box, in the mesh's own unit."""
     low, high = mesh.bounds
     side = float((high - low).max())
     if side <= 0:
         raise MeshError("the mesh has no extent: all its vertices are one point")
     return side
+
+
+def _yaw_rad(rng: np.random.Generator) -> float:
+    return rng.uniform(0, 2 * np.pi)
 
 
 def _place(mesh: Mesh, scale: float, on_floor: bool, yaw_rad: float) -> Mesh:

@@ -17,9 +17,8 @@ from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.folder import MeshFolder
-from qs3.meshes.mesh import Mesh
+from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.meshes.placement import OnFurniture, Placing, RealSize, UnitCube
-from qs3.meshes.source import MeshItem
 from qs3.report.sheets import drawn
 from qs3.report.viewer import Part, Shown
 from qs3.store.manifest import ManifestRow, read_manifest
@@ -35,7 +34,7 @@ _PAIRS = 1 << 18  # of points and triangles at once
 _PLACINGS = {f"{c.__module__}.{c.__qualname__}": c for c in (UnitCube, RealSize, OnFurniture)}
 _CATALOGUE = "qs3.catalogue.Catalogue"
 
-# As `qs3.generation.provenance` writes them, which stands above this package.
+# As `qs3.generation.kept` writes them, which stands above this package.
 _VIEW, _RESIDUAL, _NO_RESIDUAL_M = "view", "residual_m", -99.0
 
 

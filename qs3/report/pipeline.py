@@ -18,12 +18,10 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from qs3.errors import ConfigError
-from qs3.generation.objects import mesh_items
-from qs3.generation.provenance import Keep, photograph
-from qs3.generation.view_files import REASON_COLOURS, KeptView, load_views
-from qs3.meshes.io import load_mesh
-from qs3.meshes.mesh import Mesh
-from qs3.meshes.source import MeshItem
+from qs3.generation.kept import REASON_COLOURS, Keep, KeptView, load_views, photograph
+from qs3.generation.plan import mesh_items
+from qs3.meshes.io import Up, load_mesh
+from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.report.datasets import distance_to_mesh
 from qs3.sensors.optics.visibility import Reason
 from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, value_image
@@ -132,7 +130,7 @@ def scan_object(
     recipe, domain = scanner.recipe, build(cfg.domain)
     if mesh is not None:
         path = Path(mesh).expanduser()
-        up = "y" if cfg.up == "y" else "z"
+        up: Up = "y" if cfg.up == "y" else "z"
         load = partial(load_mesh, path, keep_colliders=cfg.colliders == "keep", up=up)
         item = MeshItem(object_id or path.stem, "", "train", load, path.name, path)
     else:
@@ -152,7 +150,7 @@ def scan_object(
         name=item.id,
         domain=domain.label + (f" with {' '.join(changed)}" if changed else ""),
         sensor=type(recipe.sensor).__name__ if looks else "",
-        renderer=str(cfg.renderer.get("name", "")),
+        renderer=str((cfg.get("renderer") or {}).get("name", "")),
         views=views,
         cloud=made.arrays["points"],
         clean=made.arrays.get("points_clean"),

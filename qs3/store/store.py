@@ -289,7 +289,7 @@ def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray
 
     Returns:
         [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names
-        of the columns. For "provenance" see `qs3.generation.provenance.provenance_of`.
+        of the columns. For "provenance" see `qs3.generation.kept.provenance_of`.
     """
     folder = Path(folder)
     meta = read_meta(folder)

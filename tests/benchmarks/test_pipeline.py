@@ -25,7 +25,7 @@ from qs3.datamodules.clouds import Labelled, prepare
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datasets.domain import Domain
 from qs3.generation.camera_poses import AnchoredViews
-from qs3.generation.objects import mesh_items
+from qs3.generation.plan import mesh_items
 from qs3.generation.workers import Job, scan_one
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.meshes.placement import UnitCube

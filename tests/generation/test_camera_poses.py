@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import ConfigError
 from qs3.generation.camera_poses import AnchoredViews, Drift, HandheldViews
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
 
@@ -69,8 +68,3 @@ def test_drift_starts_exact_and_grows_like_a_random_walk():
     assert np.std(ends) == pytest.approx(0.01 * np.sqrt(100), rel=0.1)
     exact = Drift().believed(poses, np.random.default_rng(0))
     np.testing.assert_allclose(exact, poses)
-
-
-def test_less_than_one_view_is_refused():
-    with pytest.raises(ConfigError, match="views must be at least 1, got 0"):
-        AnchoredViews(count=0)

@@ -4,13 +4,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pytest
 
 import qs3
-from qs3.errors import ConfigError
-from qs3.generation.checks import check
-from qs3.generation.depth_errors import DepthErrors
-from qs3.generation.plan import settings as plan_settings
+from qs3.generation.plan import planned
+from qs3.generation.recipes import DepthErrors
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.meshes.mesh import merge
 from qs3.sensors.base import DepthFrame
@@ -108,8 +105,9 @@ def test_what_stays_is_the_same_to_the_bit():
     solid = {"chair/train/one": merge([stool()]).to_trimesh()}
     words = ("domain=specklenet10", *QUICK, "views=1", "scene=room", "crop=mask")
     (plain,) = qs3.generate(solid, *words)["chair/train/one"].frames
-    for name, errors in (("no_holes", NO_HOLES), ("no_mixed_pixels", NO_MIXED)):
-        (frame,) = qs3.generate(solid, *words, f"depth_errors={name}")["chair/train/one"].frames
+    for left, errors in (("mixed_pixels", NO_HOLES), ("holes", NO_MIXED)):
+        undone = ("depth_errors=neither", f"depth_errors.{left}=true")
+        (frame,) = qs3.generate(solid, *words, *undone)["chair/train/one"].frames
         np.testing.assert_array_equal(frame.depth_m, errors.left_in(plain).depth_m)
         assert (frame.depth_m != plain.depth_m)[np.isfinite(frame.depth_m)].any() or (
             np.isnan(frame.depth_m) & np.isfinite(plain.depth_m)
@@ -118,27 +116,9 @@ def test_what_stays_is_the_same_to_the_bit():
 
 def test_the_default_adds_no_key():
     for domain in ("specklenet10", "kinectsim10"):
-        assert "depth_errors" not in plan_settings(composed(f"domain={domain}"))["recipe"]
-    off = plan_settings(composed("domain=kinectsim10", "depth_errors=neither"))["recipe"]
+        assert "depth_errors" not in planned(composed(f"domain={domain}"))._settings()["recipe"]
+    off = planned(composed("domain=kinectsim10", "depth_errors=neither"))._settings()["recipe"]
     assert off["depth_errors"]["holes"] is False
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["domain=modelnet10"], "looks at nothing, so depth_errors="),
-        (["domain=roomscan10"], "which pictures of a room pass"),
-    ],
-)
-def test_domains_without_a_fixed_view_refuse_it(words, message):
-    with pytest.raises(ConfigError, match=message):
-        check(composed(*words, "depth_errors=no_holes"))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [({"holes": "no"}, r"depth_errors\.holes"), ({"reach_px": 0}, r"depth_errors\.reach_px")],
-)
-def test_wrong_settings_are_named(settings, message):
-    with pytest.raises(ConfigError, match=message):
-        DepthErrors(**settings)
+# --- the table that asks what they are worth

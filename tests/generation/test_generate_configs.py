@@ -1,25 +1,18 @@
 """Every domain that can be generated composes, instantiates, and says what it needs."""
 
-import contextlib
 import re
 import subprocess
 import sys
 from collections import Counter
 
 import pytest
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from qs3.classes import CLASSES
-from qs3.config.hydra import build
-from qs3.config.location import CONF
-from qs3.errors import ConfigError, MissingDataError
+from qs3.errors import ConfigError
 from qs3.generation.camera_poses import AnchoredViews
-from qs3.generation.checks import KEYS, check
-from qs3.generation.objects import mesh_items
-from qs3.generation.plan import benchmark, describe, settings, stored_config
+from qs3.generation.plan import mesh_items, planned
 from qs3.generation.scenes import Alone, Room
-from qs3.tools import quickstart
 from tests.generation.generating import ROOT
 from tests.generation.generating import composed as config
 
@@ -32,11 +25,9 @@ DOMAINS = (
 
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_every_domain_has_a_recipe_and_all_ten_classes(domain):
-    cfg = config(f"domain={domain}")
-    check(cfg)
-    recipe = build(cfg.recipe)
-    assert recipe.points == 2048
-    items = mesh_items(cfg)
+    plan = planned(config(f"domain={domain}"))
+    assert plan.recipe.points == 2048
+    items = plan.items
     assert {item.cls for item in items} == set(CLASSES)
     assert {item.split for item in items} == {"train", "test"}
     assert len({item.id for item in items}) == len(items)
@@ -45,7 +36,7 @@ def test_every_domain_has_a_recipe_and_all_ten_classes(domain):
 def test_the_papers_settings_are_the_defaults_of_the_papers_dataset():
     cfg = config("domain=specklenet10")
     assert cfg.renderer.name == "blender"
-    recipe = build(cfg.recipe)
+    recipe = planned(cfg).recipe
     sensor = recipe.sensor
     assert (sensor.width_px, sensor.height_px) == (1080, 1080)
     assert sensor.width_px // sensor.step_px == 270
@@ -56,7 +47,7 @@ def test_the_papers_settings_are_the_defaults_of_the_papers_dataset():
 def test_source_and_stand_in_share_no_mesh_no_pattern_no_matcher_and_no_noise():
     source, target = config("domain=specklenet10"), config("domain=kinectsim10")
     assert source.catalogue.seed != target.catalogue.seed
-    a, b = (build(cfg.recipe).sensor for cfg in (source, target))
+    a, b = (planned(cfg).recipe.sensor for cfg in (source, target))
     assert a.pattern.seed != b.pattern.seed
     assert type(a.matcher) is not type(b.matcher)
     assert a.infrared.electrons_at_white != b.infrared.electrons_at_white
@@ -68,55 +59,25 @@ def test_source_and_stand_in_share_no_mesh_no_pattern_no_matcher_and_no_noise():
     assert not hashes[0] & hashes[1]
 
 
-def test_the_stand_in_has_the_class_frequencies_of_scannet10():
-    scannet = dict(zip(CLASSES, (98, 329, 464, 650, 2578, 161, 210, 88, 495, 1037), strict=True))
-    train = config("domain=kinectsim10").catalogue.train
-    for name, count in scannet.items():
-        assert train[name] == max(12, round(count / 10))
+def benchmark(*words, domain="kinectsim10"):
+    plan = planned(config(f"domain={domain}", *words))
+    return plan.benchmark(plan.describe({}))
 
 
-def plan(*overrides, domain="kinectsim10"):
-    cfg = config(f"domain={domain}", *overrides)
-    return benchmark(cfg, describe(cfg, mesh_items(cfg), {}))
+def test_benchmarks_know_themselves_and_their_parts():
+    """A change of any setting is another version: give it a new number and a new hash.
 
-
-def test_the_benchmark_knows_itself():
-    """A change of any setting is another version: give it a new number and a new hash."""
-    assert plan() == "kinectsim10 v2"
-    assert plan("renderer.threads=2", "renderer.variant=scalar_rgb", "workers=1") == plan()
+    The objects of a part are those of the whole, byte for byte: each has a seed of its own.
+    """
+    assert benchmark() == "kinectsim10 v2"
+    assert benchmark("renderer.threads=2", "renderer.variant=scalar_rgb") == "kinectsim10 v2"
     for other in ("fraction=0.5", "views=3", "renderer.samples=4", "recipe.min_points=100"):
-        assert plan(other).startswith("like kinectsim10 v2, but not it")
-
-
-def test_a_part_of_the_benchmark_is_called_so():
-    """Its objects are those of the whole, byte for byte: each has a seed of its own."""
-    assert plan("splits=[train]") == "kinectsim10 v2, train"
-    assert plan("splits=[test]", "workers=1") == "kinectsim10 v2, test"
-    assert plan("splits=[train]", domain="roomscan10") == "roomscan10 v4, train"
-    for other in ("fraction=0.5", "views=3", "classes=[chair,table]"):
-        assert plan("splits=[train]", other).startswith("like kinectsim10 v2, but not it")
-    cfg = config("domain=kinectsim10", "splits=[train]")
-    fewer = mesh_items(cfg)[1:]  # such as what the config does not say
-    assert benchmark(cfg, describe(cfg, fewer, {})).startswith("like kinectsim10 v2, but not it")
-
-
-def test_so_does_the_one_in_scannet10s_sizes():
-    assert plan(domain="kinectsim10_full") == "kinectsim10_full v1"
-    assert plan("limit=3", domain="kinectsim10_full").startswith("like kinectsim10_full v1, but")
-    items = mesh_items(config("domain=kinectsim10_full"))
-    assert Counter(item.split for item in items) == {"train": 6110, "test": 1769}
-    # PointDA's ScanNet-10, class by class; kinectsim10 is a part of it.
-    smaller = mesh_items(config("domain=kinectsim10"))
-    assert {item.id for item in smaller} <= {item.id for item in items}
-    by_id = {item.id: item.origin for item in items}
-    assert all(by_id[item.id] == item.origin for item in smaller)
-
-
-def test_a_source_can_have_the_sizes_of_the_published_one():
-    """4,183 and 856 objects: PointDA's ModelNet-10, from whose meshes the paper's S was scanned."""
-    items = mesh_items(config("domain=specklenet10", "counts=modelnet10"))
-    assert Counter(item.split for item in items) == {"train": 4183, "test": 856}
-    assert sum(item.cls == "lamp" for item in items) == 124 + 20
+        assert benchmark(other).startswith("like kinectsim10 v2, but not it")
+        assert benchmark("splits=[train]", other).startswith("like kinectsim10 v2, but not it")
+    assert benchmark("splits=[train]") == "kinectsim10 v2, train"
+    assert benchmark(domain="roomscan10") == "roomscan10 v4"
+    assert benchmark("recipe.torn=0.4", domain="roomscan10").startswith("like roomscan10 v4, but")
+    assert benchmark(domain="kinectsim10_full") == "kinectsim10_full v1"
 
 
 def own_meshes(root, **counts):
@@ -159,6 +120,10 @@ def test_the_catalogue_fills_up_what_own_meshes_lack(tmp_path):
     }
 
 
+def settings_of(*words):
+    return planned(config(*words))._settings()
+
+
 def test_halves_that_are_filled_up_share_no_object_of_the_catalogue(tmp_path):
     own = own_meshes(tmp_path, chair=4, lamp=1)
     (tmp_path / "table" / "train").mkdir(parents=True)  # empty: as if it were not there
@@ -172,40 +137,9 @@ def test_halves_that_are_filled_up_share_no_object_of_the_catalogue(tmp_path):
     first, second = made("first"), made("second")
     assert len(first) == 30 - 3
     assert not first & second
-    plans = [settings(config(*words, f"half={half}"))["meshes"] for half in ("first", "second")]
+    plans = [settings_of(*words, f"half={half}")["meshes"] for half in ("first", "second")]
     assert plans[0] != plans[1]
-
-
-def test_filled_up_is_another_plan_and_unfilled_the_same_as_ever(tmp_path):
-    own = own_meshes(tmp_path, **dict.fromkeys(CLASSES, 1))
-    alone = settings(config("domain=modelnet10", own, "up=z"))
-    assert alone["meshes"] == "folder"
-    filled = settings(config("domain=modelnet10", own, "up=z", "fill_up=true"))
-    assert filled["meshes"]["folder, filled up by"]["train"] == 100
-    more = settings(config("domain=modelnet10", own, "up=z", "fill_up=true", "catalogue.train=5"))
-    assert more != filled
-
-
-def test_filling_up_needs_meshes_and_says_what_it_cannot_fill(tmp_path):
-    with pytest.raises(ConfigError, match="give them with meshes=PATH"):
-        check(config("domain=modelnet10", "fill_up=true"))
-    with pytest.raises(MissingDataError, match="no folder of"):  # nothing of ours at all
-        mesh_items(config("domain=modelnet10", f"meshes={tmp_path}", "fill_up=true"))
-    own = own_meshes(tmp_path, chair=1)
-    with pytest.raises(MissingDataError, match=r"no folder of .*table"):
-        mesh_items(config("domain=modelnet10", own))
-    with pytest.raises(MissingDataError, match=r"no folder of .*airplane"):
-        mesh_items(config("domain=specklenet40", own, "fill_up=true"))
-    (tmp_path / "chair" / "train" / "catalogue-chair_0003.off").touch()
-    with pytest.raises(ConfigError, match="rename the file"):
-        mesh_items(config("domain=modelnet10", own, "fill_up=true"))
-
-
-def test_so_does_the_source_of_room_scans():
-    """Likewise: results name the version that they were measured with."""
-    assert plan(domain="roomscan10") == "roomscan10 v4"
-    for other in ("recipe.torn=0.4", "limit=3", "scans=2"):
-        assert plan(other, domain="roomscan10").startswith("like roomscan10 v4, but not it")
+    assert settings_of(*words, "half=all", "fill_up=false")["meshes"] == "folder"
 
 
 def test_smaller_keeps_the_frequencies():
@@ -219,41 +153,15 @@ def test_smaller_keeps_the_frequencies():
     assert len(several) == 3 * len(part)
 
 
-def test_a_misspelt_key_is_an_error():
-    with pytest.raises(Exception, match="samplez"):
-        config("renderer.samplez=3")
-    with pytest.raises(Exception, match="veiws"):
-        config("veiws=3")
-
-
-def test_every_command_of_the_quickstart_composes():
-    for command in quickstart.DATASETS:
-        check(config(*command.split()[1:]))
-    for row in OmegaConf.load(CONF / "table" / "quickstart.yaml").rows:
-        cfg = config(*row["target test"]["run"].split(), name="train")
-        assert cfg.experiment_name == "quickstart"
-
-
 @pytest.fixture(scope="module")
 def help_text():
     command = [sys.executable, "generate.py", "--help"]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
-def test_help_is_short(help_text):
-    for key in (
-        "domain=specklenet10", "meshes=PATH", "provenance=true", "keep_views=true", "poses=FILE",
-        "limit=", "classes=", "views=N", "workers=N", "force=true", "strict=true",
-        "paths.data_dir=",
-    ):  # fmt: skip
-        assert key in help_text
-    assert len(help_text.splitlines()) < 75
-    assert max(map(len, help_text.splitlines())) <= 110
-
-
 GROUPS = (
     *("sensor", "sensor/matcher", "synthesis", "scene", "materials", "light", "tracking", "crop"),
-    *("renderer", "released", "counts", "engine"),
+    *("renderer", "counts", "engine"),
 )
 
 
@@ -283,91 +191,29 @@ def test_scene_tracking_and_crop_go_with_every_domain_that_looks(domain):
     for i in range(max(map(len, lists))):
         chosen = [(group, some[i % len(some)]) for group, some in zip(groups, lists, strict=True)]
         cfg = config(f"domain={domain}", *(f"{group}={name}" for group, name in chosen))
-        check(cfg)
-        recipe, choice = build(cfg.recipe), dict(chosen)
+        recipe, choice = planned(cfg).recipe, dict(chosen)
         kinds = {"alone": Alone, "room": Room, "furnished": Room}
         assert type(recipe.scene) is kinds[choice["scene"]]
         assert (recipe.drift.shift_m > 0) == (choice["tracking"] == "drifting")
         assert type(recipe.crop).__name__.lower() == f"{choice['crop']}crop"
-    recipe = build(config(f"domain={domain}", "scene=room", "scene.max_clutter=0").recipe)
-    assert recipe.scene.max_clutter == 0
+
+
+def stored(cfg):
+    return planned(cfg).stored_config()
 
 
 def test_meta_holds_the_whole_config_but_places_and_what_changes_no_byte():
     overrides = ("limit=3", "scene=room", "renderer=mitsuba")
-    stored = stored_config(config(*overrides, "meshes=/mine", "workers=3", "paths.data_dir=/x"))
-    assert stored == stored_config(config(*overrides, "meshes=/yours", "renderer.threads=2"))
-    assert stored == stored_config(config(*overrides, "meshes=/mine", "engine=slurm"))
+    meta = stored(config(*overrides, "meshes=/mine", "workers=3", "paths.data_dir=/x"))
+    assert meta == stored(config(*overrides, "meshes=/yours", "renderer.threads=2"))
+    assert meta == stored(config(*overrides, "meshes=/mine", "engine=slurm"))
     whole = OmegaConf.to_container(config(*overrides))
     unkept = {"paths", "workers", "engine", "force", "strict", "renderer", "meshes"}
     kept = set(whole) - unkept
     for key in kept:
-        assert stored[key] == whole[key], key
-    assert stored["renderer"] == {k: v for k, v in whole["renderer"].items() if k != "threads"}
-    assert not re.search("/mine|/x", str(stored))
-
-
-@pytest.mark.parametrize("key", ["provenance", "keep_views", "force", "strict"])
-def test_switches_are_true_or_false(key):
-    with pytest.raises(ConfigError, match=f"{key} must be true or false, got 'maybe'"):
-        check(config(f"{key}=maybe"))
-
-
-@pytest.mark.parametrize(
-    ("domain", "words", "message"),
-    [
-        ("modelnet10", "recipe.points=0", r"recipe\.points must be >= 1, got 0"),
-        ("specklenet10", "recipe.min_points=oops", r"recipe\.min_points must be >= 0, got 'oops'"),
-        (
-            "modelnet10_dropout",
-            "recipe.dropout.max_share=0.4",
-            r"max_regions=3 times recipe\.dropout\.max_share=0\.4 is 120% of a cloud: .* 80%",
-        ),
-        ("modelnet10_dropout", "recipe.dropout.min_regions=5", r"min_regions=5 is above .*=3"),
-        ("specklenet10", "recipe.views.min_elevation_deg=60", "min_elevation_deg=60 is above"),
-        ("kinectsim10", "recipe.placing.fallback_side_m=-1", "fallback_side_m must be > 0"),
-        ("kinectsim10", "crop.min_grow_px=5", r"crop\.min_grow_px=5 is above crop\.max_grow_px=3"),
-        ("kinectsim10", "recipe.views.max_arc_deg=10", "min_arc_deg=30.0 is above"),
-        ("kinectsim10", "tracking.shift_m=-1", r"tracking\.shift_m must be >= 0, got -1"),
-        ("kinectsim10", "scene.max_clutter=-2", r"scene\.max_clutter must be a whole number >= 0"),
-        ("kinectsim10", "scene.min_albedo=0.95", r"scene\.min_albedo=0\.95 is above"),
-    ],
-)
-def test_ranges_are_checked_before_anything_is_made(domain, words, message):
-    with pytest.raises(ConfigError, match=message):
-        build(config(f"domain={domain}", words).recipe)
-
-
-@pytest.mark.parametrize(("words", "key"), [("classes=[]", "classes"), ("meshes=", "meshes")])
-def test_nothing_is_not_everything(words, key):
-    with pytest.raises(ConfigError, match=f"^{key}="):
-        check(config("domain=modelnet10", words))
-
-
-def test_a_key_that_was_added_and_that_nothing_reads_is_refused():
-    """Hydra advises + for any key it does not know; +limt=1 would scan everything."""
-    with pytest.raises(ConfigError, match="limt is no setting, nothing reads it; did you mean lim"):
-        check(config("domain=modelnet10", "+limt=1"))
-    check(config("domain=modelnet10", "+few=3", "limit=${few}"))
-
-
-@pytest.mark.parametrize("file", sorted((CONF / "synthesis").glob("*.yaml")), ids=lambda f: f.stem)
-def test_every_key_of_conf_is_known(file):
-    for more in ((), ("materials=mixed", "light=area"), ("released=yes",), ("engine=ray",)):
-        with contextlib.suppress(HydraException):  # not every domain has a light
-            assert set(config(f"synthesis={file.stem}", *more)) <= set(KEYS)
-
-
-def test_a_class_that_was_misspelt_is_told_which_is_meant():
-    with pytest.raises(ConfigError, match=r"\['chairs'\] are not .*; did you mean chair\?$"):
-        check(config("domain=modelnet10", "classes=[chairs,table]"))
-
-
-def test_who_names_other_classes_learns_how_to_give_them():
-    words = ("domain=modelnet10", "classes=[bracket]")
-    with pytest.raises(ConfigError, match=r"\['bracket'\] are not .*'\+domain.classes=\[\.\.\.\]'"):
-        check(config(*words))
-    check(config(*words, "+domain.classes=[bracket]", "domain.path=data/parts"))
+        assert meta[key] == whole[key], key
+    assert meta["renderer"] == {k: v for k, v in whole["renderer"].items() if k != "threads"}
+    assert not re.search("/mine|/x", str(meta))
 
 
 def test_scans_that_would_share_a_name_are_refused(tmp_path):
@@ -377,5 +223,39 @@ def test_scans_that_would_share_a_name_are_refused(tmp_path):
         (folder / f"{name}.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     words = ("domain=modelnet10", f"meshes={tmp_path}", "classes=[chair]")
     assert len(mesh_items(config(*words))) == 2
-    with pytest.raises(ConfigError, match=r"a~1\.off: with scans=2 another mesh's scan is called"):
+    with pytest.raises(ConfigError, match="a~1"):
         mesh_items(config(*words, "scans=2"))
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (["workers=-1"], "workers"),
+        (["classes=[chair,dragon]"], "dragon"),
+        (["classes=[]"], "classes"),
+        (["meshes="], "meshes"),
+        (["fraction=0"], "fraction"),
+        (["splits=[train,val]"], "splits"),
+        (["limit=abc"], "limit"),
+        (["force=maybe"], "force"),
+        (["views=0"], "count"),
+        (["recipe.min_points=oops"], "min_points"),
+        *((["domain=modelnet10", word], "no use") for word in ("+sensor=kinect_v1", "views=7")),
+        (["domain=modelnet10", "keep_views=true"], "no use"),
+        *((["domain=blensor10", word], "no use") for word in ("materials=mixed", "light=area")),
+        (["domain=kinectsim10", "poses=a.tar.gz"], "no use for poses"),
+        (["domain=roomscan10", "tracking=drifting"], "no use for tracking"),
+        (["domain=roomscan10", "views=3"], "views"),
+        (["domain=roomscan10", "crop=box"], "mask"),
+        (["domain=roomscan10", "scene=alone"], "scene"),
+        (["domain=roomscan10", "depth_errors=neither"], "depth_errors"),
+        (["sensor=time_of_flight", "light=bounced"], "no use for light"),
+        (["domain=modelnet10_dropout", "recipe.dropout.max_share=0.9"], "dropout"),
+        (["light=area", "light.side_m=0"], "side_m"),
+        (["materials=mixed", "materials.kinds.wood.albedo=[0.4,1.2]"], "wood.albedo"),
+        (["materials=mixed", "+materials.kinds.wood.colour=3"], "colour"),
+    ],
+)
+def test_wrong_settings_name_their_key(words, key):
+    with pytest.raises(ConfigError, match=key):
+        planned(config(*words))

@@ -16,11 +16,8 @@ from qs3.catalogue import Catalogue
 from qs3.config.hydra import build
 from qs3.datasets.depth_images import DepthImage, Pinhole
 from qs3.datasets.regions import Limits, Rules
-from qs3.errors import ConfigError
-from qs3.generation.arrangements import Arrangement
-from qs3.generation.checks import check, check_recipe
-from qs3.generation.provenance import Keep
-from qs3.generation.recipes import BoxCrop, MaskCrop, TooFewPointsError
+from qs3.generation.kept import Keep
+from qs3.generation.recipes import TooFewPointsError
 from qs3.generation.room_scans import RoomCamera, one_piece, yaw_between
 from qs3.generation.scenes import Room, Support
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
@@ -99,25 +96,6 @@ def test_by_how_much_a_placed_mesh_is_turned(seed, size):
     assert np.cos(yaw_between(mesh, placed) - yaw) == pytest.approx(1)
 
 
-def test_pitch_is_kept_within_its_range():
-    box = np.array([[-0.2, -0.2, 0], [0.2, 0.2, 0.1]])
-    law = RoomCamera(min_pitch_deg=5, max_pitch_deg=10, roll_deg=0)
-    for seed in range(20):
-        ahead = law.pose(np.random.default_rng(seed), box, LENS)[:3, 2]
-        assert 5 - 1e-6 <= np.rad2deg(-np.arcsin(ahead[2])) <= 10 + 1e-6
-
-
-def test_a_range_upside_down_names_its_key():
-    with pytest.raises(ConfigError, match=r"recipe\.camera\.min_height_m=2 is above"):
-        RoomCamera(min_height_m=2)
-
-
-@pytest.mark.parametrize("word", ["views=3", "crop=box", "scene=alone"])
-def test_what_a_scan_of_a_room_does_not_have_is_refused(word):
-    with pytest.raises(ConfigError, match=f"^.*{word.split('=')[0]}"):
-        build(composed("domain=roomscan10", word).recipe)
-
-
 def test_what_is_cut_lies_on_the_mesh_and_is_one_side_of_it(made):
     points, twin = (made.cloud.arrays[name] for name in ("points", "points_clean"))
     assert points.shape == twin.shape == (2048, 3)
@@ -141,34 +119,6 @@ def test_the_same_seed_gives_the_same_bytes_and_what_is_kept_changes_none(made):
     assert made.cloud.arrays["provenance"].shape == (2048, 5)
 
 
-def test_fronts_are_seen_as_often_as_is_said_and_an_empty_arrangement_changes_nothing(made):
-    bare = replace(made.recipe, fronts={}, arrangement=None)
-    for seed in range(2):
-        first = bare.make(made.mesh, ID, seed, made.renderer).arrays["points"]
-        same = replace(bare, arrangement=Arrangement()).make(made.mesh, ID, seed, made.renderer)
-        np.testing.assert_array_equal(first, same.arrays["points"])
-    before = []
-    for seed in range(6):
-        recipe = replace(bare, fronts={"chair": 1.0})
-        frame = recipe.make(made.mesh, ID, seed, made.renderer).frames[0]
-        placed = recipe.placing.place(made.mesh, object_rng(seed, ID, 0), ID)
-        eye = frame.camera.world_from_camera[:2, 3] - placed.bounds.mean(axis=0)[:2]
-        high = placed.vertices[placed.vertices[:, 2] > 0.7, :2].mean(axis=0)  # of the back
-        before.append(eye @ (high - placed.bounds.mean(axis=0)[:2]) < 0)
-    assert all(before)
-
-
-def test_a_table_hides_some_of_its_chair(made):
-    bare = replace(made.recipe, scene=Room(wall=0, max_clutter=0, max_occluders=0), fronts={})
-    seen = []
-    for law in (None, Arrangement(tables={"chair": 1.0}, apart_m=0)):
-        recipe = replace(bare, arrangement=law, attempts=1, rules=replace(bare.rules, most_occ=1.0))
-        clouds = [recipe.make(made.mesh, ID, seed, made.renderer) for seed in range(3)]
-        seen.append(np.array([(cloud.frames[0].label == 1).sum() for cloud in clouds]))
-    assert (seen[1] <= seen[0]).all()
-    assert seen[1].sum() < 0.9 * seen[0].sum()
-
-
 def test_a_worktop_is_not_its_cabinet_s(made):
     recipe = replace(made.recipe, worktops={"chair": 1.0}, torn=0.0)
     solid = trimesh.creation.box((0.8, 0.5, 0.8))
@@ -180,17 +130,10 @@ def test_a_worktop_is_not_its_cabinet_s(made):
         assert whole.arrays["points_clean"][:, 2].max() == pytest.approx(0.8, abs=1e-3)
 
 
-@pytest.mark.parametrize("chance", [1.5, -0.1])
-@pytest.mark.parametrize("name", ["fronts", "worktops"])
-def test_a_chance_outside_0_and_1_names_its_key(made, name, chance):
-    with pytest.raises(ConfigError, match=rf"recipe\.{name}\.sofa must be in"):
-        replace(made.recipe, **{name: {"sofa": chance}})
-
-
 def test_an_object_that_no_picture_shows_well_says_why(made):
     far = replace(made.recipe.camera, min_distance_m=30, max_distance_m=31)
     recipe = replace(made.recipe, camera=far, attempts=2)
-    with pytest.raises(TooFewPointsError, match=r"none of 2 pictures .* pixels with depth"):
+    with pytest.raises(TooFewPointsError):
         recipe.make(made.mesh, ID, 0, made.renderer)
 
 
@@ -221,47 +164,6 @@ def test_things_stand_on_others_as_often_as_is_said(made, lamp):
     assert not any(place(floor_lamp, _rng(s), "lamp/x").bounds[0, 2] for s in range(20))
     always = replace(made.recipe.placing, raised={"lamp": 1.0}, tallest_m=2.0)
     assert all(always.place(floor_lamp, _rng(s), "lamp/x").bounds[0, 2] >= 0.4 for s in range(20))
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: OnFurniture(stands_m={"lamp": (0.8, 0.4)}), r"stands_m\.lamp=\[0\.8, 0\.4\]"),
-        (lambda: OnFurniture(stands_m={"lamp": (0.8,)}), r"expected \[lowest, highest\]"),
-        (
-            lambda: OnFurniture(stands_m={"lamp": (0.4, 0.8)}, raised={"lamp": 1.5}),
-            r"recipe\.placing\.raised\.lamp must be in \[0, 1\]",
-        ),
-        (lambda: OnFurniture(raised={"lamp": 1}), r"raised\.lamp: on what\? Give stands_m\.lamp"),
-        (lambda: Support(min_leg_m=0.1), r"min_leg_m <= max_leg_m must hold, got 0\.1 and 0\.08"),
-        (lambda: Support(block=2), r"scene\.support\.block must be in"),
-    ],
-)
-def test_wrong_furniture_names_its_key(make, message):
-    with pytest.raises(ConfigError, match=message):
-        make()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["crop.margin_m=0"], "crop.margin_m=0 says nothing to a scan of a room"),
-        (["crop.margin_m=-0.5"], r"crop\.margin_m must be >= 0"),
-        (["tracking=drifting"], "tracking= says nothing to it"),
-        (["tracking=drifting", "tracking.turn_rad=0"], "tracking= says nothing to it"),
-    ],
-)
-def test_settings_that_do_nothing_to_a_room_are_refused(words, message):
-    cfg = composed("domain=roomscan10", *words)
-    check(cfg)
-    with pytest.raises(ConfigError, match=message):
-        check_recipe(build(cfg.recipe), cfg)
-
-
-def test_a_negative_margin_is_refused():
-    for crop in (BoxCrop, MaskCrop):
-        with pytest.raises(ConfigError, match=r"crop\.margin_m must be >= 0"):
-            crop(margin_m=-0.01)
 
 
 @pytest.mark.parametrize("block", [0.0, 1.0])
@@ -397,20 +299,6 @@ def test_a_piece_is_drawn_among_those_that_are_large_enough():
     own[:, 30:] = own[50:, :30] = False
     assert np.array_equal(one_piece(image, own, "chair", none, _rng(0)), own)
     assert not one_piece(image, np.zeros_like(own), "chair", rules, _rng(0)).any()
-
-
-def test_pieces_between_camera_and_object_cover_some_of_it():
-    solid = trimesh.creation.box((0.6, 0.6, 0.9), transform=np.eye(4))
-    mesh = Mesh(solid.vertices + np.array([0, 0, 0.45]), solid.faces)
-    eye = np.array([[3.0, 0.0, 1.3]])
-    covered = []
-    for seed in range(60):
-        scene = Room(wall=0, max_clutter=0, max_occluders=0, max_between=2)
-        bodies = scene.bodies(mesh, eye, np.random.default_rng(seed))
-        pieces = [body.mesh for body in bodies[2:]]
-        assert all(piece.bounds[1, 2] <= 0.8 + 1e-9 for piece in pieces)
-        covered.append(any((nearest_hit(eye[0], mesh.vertices, p) < 1).any() for p in pieces))
-    assert 10 < sum(covered) < 55
 
 
 def nearest_hit(eye, points, mesh):

@@ -1,7 +1,10 @@
 """Mesh files written for the tests, and what two meshes are compared by."""
 
 import base64
+import io
+import re
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -29,11 +32,10 @@ def save(folder, name, content):
     return path
 
 
-def refused(folder, name, content, reason):
+def refused(folder, name, content):
     path = save(folder, name, content)
-    with pytest.raises(MeshError, match=reason) as caught:
+    with pytest.raises(MeshError, match=re.escape(name)):
         load_mesh(path)
-    assert str(path) in str(caught.value)
 
 
 def z_up(mesh):
@@ -145,3 +147,30 @@ def dae(
   <node id="loop"><instance_node url="#loop"/></node></library_nodes>
 <library_visual_scenes><visual_scene id="s">{nodes}</visual_scene></library_visual_scenes>
 <scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+MESH_3MF = """<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/>
+<vertex x="0" y="1" z="0"/></vertices>
+<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh>"""
+RESOURCES = f"""<object id="1" type="model">{MESH_3MF}</object>
+<object id="2" type="model"><components><component objectid="1"/>
+<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 5 0 0"/></components></object>"""
+
+
+def item(number, x=0, more=""):
+    return f'<item objectid="{number}" {more} transform="1 0 0 0 1 0 0 0 1 {x} 0 0"/>'
+
+
+PLATE = item(2)
+
+
+def threemf(items=PLATE, resources=RESOURCES, unit='unit="meter"', name="3D/3dmodel.model"):
+    text = f"""<?xml version="1.0" encoding="UTF-8"?>
+<model {unit} xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+ xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06">
+<resources>{resources}</resources><build>{items}</build></model>"""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr(name, text)
+    return file.getvalue()

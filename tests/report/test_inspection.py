@@ -11,7 +11,7 @@ from trimesh.triangles import closest_point
 
 from qs3.catalogue import Catalogue
 from qs3.errors import ConfigError
-from qs3.generation.provenance import NO_RESIDUAL_M, PROVENANCE
+from qs3.generation.kept import NO_RESIDUAL_M, PROVENANCE
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
 from qs3.report import inspection

@@ -1,0 +1,402 @@
+"""Formats of scenes: glTF, COLLADA and 3MF, where instances stand, and nodes that are left out."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import MeshError
+from qs3.meshes.gltf import buffer_files
+from qs3.meshes.io import load_mesh
+from qs3.meshes.mesh import Colliders, Mesh
+from tests.meshes.written import (
+    MESH_3MF,
+    PRIMITIVES,
+    PYRAMID,
+    RESOURCES,
+    TRIANGLE,
+    TRIANGLES,
+    corners,
+    dae,
+    gltf,
+    item,
+    refused,
+    save,
+    threemf,
+    z_up,
+)
+
+
+def save_gltf(folder, tree, name="a.gltf"):
+    return save(folder, name, json.dumps(tree))
+
+
+def test_gltf_scene_with_strips_a_camera_and_transforms(tmp_path):
+    mesh = load_mesh(save_gltf(tmp_path, gltf()[0]))
+    assert len(mesh.faces) == 12
+    first, second = mesh.vertices[:12], mesh.vertices[12:]
+    # turned by 90 degrees about z, doubled, moved; then y up becomes z up
+    np.testing.assert_allclose([first.min(0), first.max(0)], [[8, 0, 0], [10, 0, 2]], atol=1e-6)
+    np.testing.assert_allclose([second.min(0), second.max(0)], [[0, -7, 0], [1, -7, 1]])
+    doubled = np.cross(*(np.diff(corners(mesh), axis=1)[:, i] for i in range(2)))
+    assert np.linalg.norm(doubled, axis=1).sum() / 2 == pytest.approx(3 * 4 + 3 * 1)
+    without = load_mesh(save_gltf(tmp_path, gltf(scenes=[])[0]))
+    assert without.sha256 == mesh.sha256
+
+
+def test_gltf_is_read_as_trimesh_reads_it(tmp_path):
+    scene = trimesh.Scene([PYRAMID, trimesh.creation.box()])
+    path = save(tmp_path, "a.glb", scene.export(file_type="glb"))
+    theirs, ours = z_up(trimesh.load_mesh(path)), load_mesh(path).to_trimesh()
+    assert ours.area == pytest.approx(theirs.area)
+    np.testing.assert_allclose(ours.bounds, theirs.bounds, atol=1e-6)
+
+
+def quantized(folder):
+    """A triangle of normalised numbers with a stride, in a file of its own."""
+    points = np.zeros((3, 4), dtype="<i2")
+    points[:, :3] = [[0, 0, 0], [32767, 0, 0], [0, 32767, -32768]]
+    save(folder, "my points.bin", points.tobytes())
+    tree, _ = gltf()
+    tree.pop("scenes")
+    shape = {"componentType": 5122, "type": "VEC3", "count": 3, "normalized": True}
+    return tree | {
+        "extensionsRequired": ["KHR_mesh_quantization", "KHR_materials_unlit"],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, **shape}],
+        "bufferViews": [{"buffer": 0, "byteLength": 24, "byteStride": 8}],
+        "buffers": [{"byteLength": 24, "uri": "my%20points.bin"}],
+    }
+
+
+def test_gltf_quantized_strided_and_without_scenes(tmp_path):
+    path = save_gltf(tmp_path, quantized(tmp_path))
+    assert load_mesh(path).vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 1]]
+    assert buffer_files(path) == [tmp_path / "my points.bin"]
+
+
+def test_buffers_within_a_file_are_not_looked_for(tmp_path):
+    tree, blob = gltf()
+    assert buffer_files(save_gltf(tmp_path, tree)) == []
+    beside = {"byteLength": 76, "uri": "b.bin"}
+    expected = save(tmp_path, "b.bin", blob)
+    text = json.dumps({**tree, "buffers": [{"byteLength": 76}, beside]}).encode()
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A)
+    assert buffer_files(save(tmp_path, "a.glb", head + text)) == [expected]
+    for damaged in (b"", b"glTF", head + text[:-1], b'{"asset": 1, "buffers": 2}'):
+        assert buffer_files(save(tmp_path, "a.glb", damaged)) == []
+
+
+def test_hidden_nodes_are_left_out_with_all_below(tmp_path, caplog):
+    for hidden, left in ((0, 1), (1, 1), (2, 0)):
+        tree, _ = gltf(extensionsRequired=["KHR_node_visibility"])
+        only, _ = gltf(scenes=[{"nodes": [[0], [2]][left]}])
+        tree["nodes"][hidden]["extensions"] = {"KHR_node_visibility": {"visible": False}}
+        mesh = load_mesh(save_gltf(tmp_path, tree))
+        assert mesh.sha256 == load_mesh(save_gltf(tmp_path, only, "b.gltf")).sha256
+        assert "1 hidden" in caplog.text
+        caplog.clear()
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        *("../secret.bin", "/etc/passwd", "link.bin", "sub/../../secret.bin", "gone.bin"),
+        *("http://example.com/a.bin", "file:///etc/passwd", ".", "data:,xyz"),
+    ],
+)
+def test_gltf_reads_nothing_outside_of_its_folder(tmp_path, uri):
+    folder = tmp_path / "mesh"
+    folder.mkdir()
+    tree, blob = gltf(buffers=[{"byteLength": 76, "uri": uri}])
+    save(tmp_path, "secret.bin", blob)
+    (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
+    refused(folder, "a.gltf", json.dumps(tree))
+    assert buffer_files(folder / "a.gltf") == []
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("asset", "version"), "1.0"),
+        (("extensionsRequired",), ["KHR_draco_mesh_compression"]),
+        (("nodes", 1, "children"), [0]),
+        (("nodes", 2, "skin"), 0),
+        (("nodes", 2, "extensions"), {"EXT_mesh_gpu_instancing": {}}),
+        (("accessors", 0, "sparse"), {}),
+        (("accessors", 0, "count"), 5),
+        (("accessors", 0, "count"), -1),
+        (("accessors", 0, "type"), "MAT4"),
+        (("accessors", 0, "byteOffset"), -4),
+        (("accessors", 1, "byteOffset"), 10**9),
+        (("bufferViews", 0, "byteOffset"), 40),
+        (("bufferViews", 1, "byteOffset"), 0),
+        (("meshes", 0, "primitives", 2, "mode"), 6),
+        (("meshes", 0, "primitives"), []),
+        (("buffers",), [{}]),
+        (("scene",), 3),
+        (("scene",), -1),
+    ],
+)
+def test_gltf_that_is_broken_or_not_read_is_refused(tmp_path, path, value):
+    tree, _ = gltf()
+    place = tree
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    refused(tmp_path, "a.gltf", json.dumps(tree))
+
+
+def test_morph_targets_that_move_vertices_are_refused(tmp_path):
+    """A node's weights count before its mesh's; colliders' count for nothing."""
+
+    def text(target="POSITION", mesh=None, node=None, name=""):
+        tree, _ = gltf()
+        for part in tree["meshes"][0]["primitives"]:
+            part["targets"] = [{"NORMAL": 0}, {target: 0}]
+        tree["meshes"][0] |= {"weights": mesh} if mesh else {}
+        tree["nodes"][2] |= {"weights": node} if node else {}
+        tree["nodes"][2]["name"] = name
+        return json.dumps(tree)
+
+    for fine in ({"mesh": [1.0, 0]}, {"mesh": [1, 1], "target": "NORMAL"}, {"node": [0.5]}):
+        assert len(load_mesh(save(tmp_path, "a.gltf", text(**fine))).faces) == 12
+    refused(tmp_path, "a.gltf", text(mesh=[0, 0.25]))
+    refused(tmp_path, "a.gltf", text(mesh=[0, 0], node=[0, -1]))
+    left_out = save(tmp_path, "b.gltf", text(node=[0, 1], name="UCX_a"))
+    assert len(load_mesh(left_out).faces) == 6
+
+
+# ---------------------------------------------------------------------------- COLLADA
+
+
+@pytest.mark.parametrize("kind", PRIMITIVES)
+def test_collada_primitives(tmp_path, kind):
+    mesh = load_mesh(save(tmp_path, "a.dae", dae(PRIMITIVES[kind])))
+    square = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0]])
+    assert corners(mesh).tolist() == square[[[0, 1, 2], [0, 2, 3]]].tolist()
+
+
+@pytest.mark.parametrize(
+    ("up", "high"),
+    [("X_UP", [0, 0, 0.5]), ("Y_UP", [0.5, 0, 0.5]), ("Z_UP", [0.5, 0.5, 0])],
+)
+def test_collada_axes(tmp_path, up, high):
+    mesh = load_mesh(save(tmp_path, "a.dae", dae(up=up)))
+    np.testing.assert_allclose(mesh.bounds[1], high, atol=1e-12)
+
+
+def test_collada_transforms_in_order(tmp_path):
+    nodes = """<node><translate>10 0 0</translate><rotate>0 0 1 90</rotate><scale>2 4 1</scale>
+      <node><matrix>1 0 0 1  0 1 0 0  0 0 1 3  0 0 0 1</matrix><instance_node url="#n"/></node>
+      <instance_geometry url="#g"/></node>"""
+    mesh = load_mesh(save(tmp_path, "a.dae", dae(nodes=nodes)))
+    # each square's corners are 0, 1, 2 and 0, 2, 3; the inner node comes first
+    inner, here = (mesh.vertices * 2).reshape(2, 6, 3)
+    np.testing.assert_allclose(here[[1, 5]], [[10, 2, 0], [6, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(inner[[1, 5]], [[10, 4, 3], [6, 2, 3]], atol=1e-6)
+
+
+def test_a_scene_a_node_and_a_geometry_may_share_an_id(tmp_path):
+    """As 132 of 140 sound files of a collection do."""
+    nodes = '<node id="s"><instance_geometry url="#s"/><instance_node url="#g"/></node>'
+    content = dae(nodes=nodes).replace('geometry id="g"', 'geometry id="s"')
+    library = '<node id="g"><translate>0 0 2</translate><instance_geometry url="#s"/>'
+    content = content.replace('<node id="n"><instance_geometry url="#g"/>', library)
+    mesh = load_mesh(save(tmp_path, "a.dae", content))
+    assert corners(mesh)[:, :, 2].tolist() == [[0, 0, 0]] * 2 + [[1, 1, 1]] * 2
+
+
+def test_what_pycollada_would_misread(tmp_path):
+    """Two lists of triangles, a polygon of two corners, normals that do not exist, a camera."""
+    plain = corners(load_mesh(save(tmp_path, "a.dae", dae()))).tolist()
+    two = TRIANGLES.replace(" 0 9 2 9 3 9", "</p><p>0 9 2 9 3 9")
+    thin = PRIMITIVES["polylist"].replace("<vcount>4<", "<vcount>2 4 1<")
+    thin = thin.replace("<p>", "<p>7 1 7 3 ").replace("</p>", " 7 2</p>")
+    camera = '<node><lookat>1</lookat><instance_camera url="#gone"/></node>'
+    bare = '<polygons count="0"><input semantic="VERTEX" source="#v" offset="0"/></polygons>'
+    for content in (
+        dae(two),
+        dae(thin),
+        dae(TRIANGLES + bare),
+        dae(TRIANGLES.replace('NORMAL" source="#v"', 'NORMAL" source="#gone"')),
+        dae(nodes=camera + '<node><instance_geometry url="#g"/></node>'),
+    ):
+        assert corners(load_mesh(save(tmp_path, "a.dae", content))).tolist() == plain
+
+
+LOOKAT = '<node><lookat>1</lookat><instance_geometry url="#g"/></node>'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        dae().replace("1 1 0 0", "1 nan 0 0"),
+        dae(nodes='<node><instance_node url="#loop"/></node>'),
+        dae(nodes='<node><instance_geometry url="other.dae#g"/></node>'),
+        dae(nodes='<node><instance_controller url="#g"/></node>'),
+        dae(nodes="<node/>"),
+        dae(nodes=LOOKAT),
+        dae(TRIANGLES.replace("3 9<", "4 9<")),
+        dae(TRIANGLES.replace("3 9<", "-1 9<")),
+        dae(TRIANGLES.replace(" 3 9<", "<")),
+        dae(TRIANGLES.replace("triangles", "tristrips")),
+        dae().replace('count="4"', 'count="40"'),
+        *("<COLLADA/>", "<html/>", "hello"),
+    ],
+)
+def test_collada_that_is_broken_or_not_read_is_refused(tmp_path, content):
+    refused(tmp_path, "a.dae", content)
+
+
+# ---------------------------------------------------------------------------- 3MF
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"), [('unit="inch"', 0.0254), ('unit="meter"', 1), ("", 0.001)]
+)
+def test_components_and_units(tmp_path, unit, metres):
+    build = '<item objectid="2" transform="2 0 0 0 2 0 0 0 2 0 0 3"/>'
+    mesh = load_mesh(save(tmp_path, "a.3mf", threemf(build, unit=unit)))
+    turned = np.array([[5, 0, 0], [5, 1, 0], [4, 0, 0]])
+    expected = np.stack([2 * TRIANGLE, 2 * turned]) + np.array([0, 0, 3])
+    np.testing.assert_allclose(corners(mesh), metres * expected, atol=1e-12)
+
+
+def test_items_of_one_object_with_one_part_number(tmp_path):
+    items = "".join(item(1, x, 'partnumber="LEG-01"') for x in (0, 5, 7))
+    mesh = load_mesh(save(tmp_path, "a.3mf", threemf(items)))
+    expected = [TRIANGLE + np.array([x, 0, 0]) for x in (0, 7, 5)]  # as without the number
+    np.testing.assert_array_equal(corners(mesh), expected)
+
+
+def test_an_assembly_of_assemblies_is_there_to_its_last_screw(tmp_path):
+    """164 instances: trimesh stops at 121 steps."""
+    link = '<component objectid="{}" transform="1 0 0 0 1 0 0 0 1 {} 0 0"/>'
+    resources = f'<object id="1">{MESH_3MF}</object>' + "".join(
+        f'<object id="{name}"><components>'
+        + "".join(link.format(name - 1, step * i) for i in range(count))
+        + (link.format(1, -1) if name == 3 else "")
+        + "</components></object>"
+        for name, count, step in ((2, 10, 1), (3, 4, 10), (4, 4, 100))
+    )
+    mesh = load_mesh(save(tmp_path, "a.3mf", threemf(item(4), resources)))
+    found = sorted(corners(mesh)[:, 0, 0])
+    expected = [100 * a + 10 * b + c for a in range(4) for b in range(4) for c in range(10)]
+    assert found == sorted(expected + [100 * a - 1 for a in range(4)])
+
+
+@pytest.mark.parametrize("kind", ["support", "solidsupport", "other"])
+def test_supports_are_no_furniture(tmp_path, caplog, kind):
+    more = f'<object id="7" type="{kind}">{MESH_3MF}</object>'
+    assembly = '<object id="8"><components><component objectid="7"/></components></object>'
+    content = threemf(item(1) + item(7) + item(8), RESOURCES + more + assembly)
+    assert len(load_mesh(save(tmp_path, "a.3mf", content)).faces) == 1
+    assert "2 objects for printing" in caplog.text
+    refused(tmp_path, "b.3mf", threemf(item(8), more + assembly))
+
+
+LOOP = '<object id="2"><components><component objectid="2"/></components></object>'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"PK", threemf()[:-30], threemf(name="other.model"), threemf(""), threemf(item(7))),
+        *(threemf(resources=LOOP), threemf(unit='unit="ell"')),
+        threemf(resources=RESOURCES.replace("component o", 'component p:path="/3D/b" o')),
+        threemf(resources=RESOURCES.replace('v3="2"', 'v3="3"')),
+        threemf(resources=RESOURCES.replace('x="1"', 'x="one"')),
+    ],
+)
+def test_archives_that_are_broken_or_not_read_are_refused(tmp_path, content):
+    refused(tmp_path, "a.3mf", content)
+
+
+# ---------------------------------------------------------------------------- colliders
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("chair_collider", "Chair_Collider.001", "COLLIDER", "leg-collision_2", "legs colliders"),
+        *("UCX_chair_01", "ubx_a", "UCP_a", "USP_a", "MCDCX_a", "a-colonly", "a-ConvColOnly_1"),
+    ],
+)
+def test_names_of_colliders(name):
+    colliders = Colliders()
+    assert colliders.left_out("node", name)
+    assert colliders.left_out(name, None)
+    assert colliders.count == 2
+    assert not Colliders(skip=False).left_out(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["collidercoaster", "a-col", "UCXchair", "a_UCX_b", "recollision", "collider_of", "", 7]
+)
+def test_names_of_others(name):
+    assert not Colliders().left_out(name, None)
+
+
+@pytest.mark.parametrize("kind", ["glb", "3mf"])
+def test_a_scene_with_a_collider_on_disk_and_in_memory(tmp_path, kind):
+    scene = trimesh.Scene()
+    scene.add_geometry(PYRAMID, node_name="chair", geom_name="chair")
+    scene.add_geometry(trimesh.creation.box((9, 9, 9)), node_name="UCX_chair_01")
+    path = save(tmp_path, f"a.{kind}", scene.export(file_type=kind))
+    plain = save(tmp_path, f"b.{kind}", trimesh.Scene(PYRAMID).export(file_type=kind))
+    np.testing.assert_array_equal(corners(load_mesh(path)), corners(load_mesh(plain)))
+    for keep in (False, True):
+        read = load_mesh(path, keep_colliders=keep)
+        assert (len(read.faces), read.colliders) == ((18, 0) if keep else (6, 1))
+        for held in (scene, trimesh.load(path)):
+            mesh = Mesh.from_trimesh(held, keep_colliders=keep)
+            assert (len(mesh.faces), mesh.colliders) == (len(read.faces), read.colliders)
+
+
+def test_what_hangs_below_a_collider_goes_too_and_a_mesh_may_be_one(tmp_path):
+    tree, _ = gltf()
+    tree["nodes"][0]["name"] = "all_collider"
+    mesh = load_mesh(save_gltf(tmp_path, tree))
+    assert (len(mesh.faces), mesh.colliders) == (6, 1)
+    tree["meshes"][0]["name"] = "square_collider"
+    refused(tmp_path, "b.gltf", json.dumps(tree))
+    assert len(load_mesh(tmp_path / "b.gltf", keep_colliders=True).faces) == 12
+
+
+def test_colliders_of_collada_and_3mf(tmp_path):
+    square = '<instance_geometry url="#g"/>'
+    nodes = f'<node>{square}<node name="UCX_a">{square}<node>{square}</node></node></node>'
+    path = save(tmp_path, "a.dae", dae(nodes=nodes))
+    assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (2, 1)
+    assert len(load_mesh(path, keep_colliders=True).faces) == 6
+    refused(tmp_path, "b.dae", dae().replace('geometry id="g"', 'geometry id="g" name="UCX_seat"'))
+    named = '<object id="{}" name="{}"><components>{}</components></object>'
+    links = '<component objectid="1"/>' * 2
+    assemblies = named.format(3, "UCX_chair", links) + named.format(4, "b", links)
+    build = item(1) + item(3) + item(4, more='partnumber="b_collider"')
+    path = save(tmp_path, "a.3mf", threemf(build, RESOURCES + assemblies))
+    assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (1, 2)
+    assert len(load_mesh(path, keep_colliders=True).faces) == 5
+
+
+def test_below_a_node_in_memory():
+    """All of it goes and is counted once; below a mesh of such a name the rest stays."""
+
+    def held(node, mesh):
+        scene = trimesh.Scene()
+        scene.add_geometry(PYRAMID, node_name="chair", geom_name="chair")
+        scene.add_geometry(PYRAMID, node_name=node, geom_name=mesh)
+        scene.add_geometry(PYRAMID, node_name="b", geom_name="leg", parent_node_name=node)
+        scene.add_geometry(PYRAMID, node_name=7, geom_name="foot", parent_node_name="b")
+        scene.add_geometry(PYRAMID, node_name="c_collider", geom_name="c", parent_node_name="b")
+        return scene
+
+    names = [("a_collider", "a"), ("a", "a_collision"), ("a", "a")]
+    found = [Mesh.from_trimesh(held(*some)) for some in names]
+    assert [(len(m.faces) // 6, m.colliders) for m in found] == [(1, 1), (3, 2), (4, 1)]
+    with pytest.raises(MeshError):
+        Mesh.from_trimesh(trimesh.Scene({"a_collider": PYRAMID}))
