@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from qs3.errors import DataError
 from qs3.store.meta import MadeOf
 from qs3.utils.files import write_text
-from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.settings import problems
 
 METRICS = "metrics.json"
 FINISHED: Final = "finished"
@@ -120,17 +120,13 @@ class PseudoLabelScores:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class RoundRecord:
-    """One round of self-training.
+    """One round of self-training, from 0; target clouds by class, and of all classes.
 
     Attributes:
-        round: from 0.
-        theta: threshold of the round.
-        confident, selected: target clouds by class.
         mu, thresholds: by class, where the selector has them.
-        total_confident, total_selected: of all classes.
         missing_classes: without a pseudo-label.
         agreement: share of labels as in the round before; None in round 0.
-        with_target_labels: None where nobody knows these.
+        with_target_labels: None where these are not known.
     """
 
     round: int
@@ -151,11 +147,8 @@ class StudentChoice:
     """How the reported epoch of the last round was chosen, where it is not the last one.
 
     Attributes:
-        rule: of `selection.student`.
-        epoch, score: the chosen one.
-        scores: by epoch.
+        scores: of `selection.student`'s rule by epoch.
         held_out: clouds that were held out of the last round for it.
-        last: the last epoch's student, for comparison.
     """
 
     rule: str
@@ -243,12 +236,7 @@ class TrainingAccuracy:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class DataHashes:
-    """`PointSet.sha256` of both datasets.
-
-    Attributes:
-        source: of the labelled clouds, so the target's for `method=supervised`.
-        beside: of twins or views that were trained on, too; "" without, and in older files.
-    """
+    """`PointSet.sha256` of both datasets; the source's is the target's for `method=supervised`."""
 
     source: str
     target: str
@@ -265,15 +253,7 @@ class DataMadeOf:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Times:
-    """What the run took, over all of its starts.
-
-    Attributes:
-        seconds: wall time.
-        core_seconds: user and system time of the process, its threads and its children; None: not
-            known, as of runs before it was counted.
-        memory_gb: the most that a start's process had in memory; None: not known.
-        gpu_memory_gb: the most that torch had taken on the GPU; None without one.
-    """
+    """What the run took, over all of its starts: wall time, processor time, most memory."""
 
     seconds: float
     core_seconds: float | None = None
@@ -286,13 +266,10 @@ class RunMetrics:
     """`metrics.json`.
 
     Attributes:
-        experiment: name; with the hash of the config and the seed it names the run's folder.
         source, target: names of the domains; source is the target for `method=supervised`.
-        simulated: whether the target's reality is.
-        method, selftraining, model: as on the command line.
+        simulated: whether the target is.
         final: the reported scores: the student's, without rounds the warm-up's.
         validators: label-free scores by name.
-        quality: estimates of accuracy that need no label of the target.
         training: with `data.clouds_a_class` alone.
         versions: of the software that began the run.
     """
@@ -330,15 +307,10 @@ class RunMetrics:
 
     @property
     def seen(self) -> dict[str, str]:
-        """SHA-256 of all that it was trained on: "source", "target", "beside" and "weights".
-
-        "" of what it had none of. The source's is the target's for `method=supervised`: older files
-        name one there that nobody used.
-        """
+        """SHA-256 of all that it was trained on; "" of what it had none of."""
         return {
             "source": self.data.target if self.method == "supervised" else self.data.source,
             "target": self.data.target,
-            "beside": self.data.beside,
             "weights": self.versions.get("weights", "").rpartition(" ")[2],
         }
 
@@ -375,18 +347,15 @@ def read_metrics(folder: str | Path) -> RunMetrics | None:
     """
     path = Path(folder) / METRICS
     try:
-        return _SCHEMA.validate_json(read_whole(path, JSON_PEAK))
+        return _SCHEMA.validate_json(path.read_bytes())
     except FileNotFoundError:
         return None
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
-        raise DataError(f"{path} is damaged: {place}: {first['msg']}; {_REMEDY}") from error
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error}); {_REMEDY}") from error
-
-
-_REMEDY = "delete it and repeat the run's command, which trains nothing again"
+    except (OSError, ValidationError) as error:
+        why = error if isinstance(error, OSError) else problems(error)
+        raise DataError(
+            f"{path} is damaged ({why}); delete it and repeat the run's command, which trains "
+            "nothing again"
+        ) from error
 
 
 def write_metrics(folder: str | Path, metrics: RunMetrics) -> None:

@@ -53,7 +53,6 @@ _BEGUN = ("started.json", "last.ckpt", ".hydra")
 _SEEN = {
     "source_data": "the source dataset differs",
     "target_data": "the target dataset differs",
-    "beside_data": "twins or views of the source differ",
     "weights": "the classifier that they began with differs",
 }
 MESHES, BLOCKS, ROOMS, CLOUDS = "meshes", "blocks of frames", "rooms", "clouds"

@@ -12,9 +12,10 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
+from omegaconf import DictConfig
 
 from qs3.config.compose import choices, composed
 from qs3.config.location import typed
@@ -208,18 +209,15 @@ def build_table(
     Args:
         name: of a file in conf/table, or the path of one's own, NAME.yaml.
         log_dir: `paths.log_dir` of the runs.
-        extra: overrides of train.py for every cell, as the runs had them, or for the cells of
-            some columns (`spec.by_column`).
-        target: another target domain for all cells, e.g. "kinectsim10"; the paper's numbers,
-            measured on another target, are then left out.
+        extra: overrides of all runs, or of those of some columns (`spec.by_column`).
+        target: another target domain for all cells; published numbers are then left out.
         kept: file of results of `qs3 report keep`; taken where `log_dir` lacks a seed.
         rows: further ones, as in the file.
         columns: only these (`spec.chosen`), and those that are published alone.
-        runs: look for them; without, what the file says is there at once.
+        runs: look for them.
 
     Raises:
-        ConfigError: no such table, its file or an override is wrong, one of `columns` means none,
-            or `target` is given for a table whose columns have targets of their own.
+        ConfigError: no such table, or its file, an override, a column or the target is wrong.
     """
     name, spec = read_spec(name, rows)
     if target and target not in choices("domain"):
@@ -282,12 +280,16 @@ def _filled(
     lines = pd.DataFrame()
     if kept is None or found:
         place = f"table cell {cell.row!r}, {cell.column!r}: "
-        run = _composed(_known_words(cell), place)
-        if target and run.supervised:  # the upper bound has labels of its target
-            cell = replace(cell, overrides=(*cell.overrides, f"domain@data.source={target}"))
-            run = _composed(_known_words(cell), place)
-        cell = replace(cell, target=run.target, simulated=run.simulated)
-        if runs := found.get((run.experiment, run.hash)):
+        # Without the place of runs, which is not hashed: all folders share what is cached.
+        words = tuple(word for word in cell.overrides if not word.startswith("paths.log_dir="))
+        key, cfg = _composed(words, place)
+        if target and str(cfg.method.get("_target_")).endswith(".Supervised"):
+            more = f"domain@data.source={target}"  # the upper bound has labels of its target
+            cell = replace(cell, overrides=(*cell.overrides, more))
+            key, cfg = _composed((*words, more), place)
+        domain = cfg.data.target
+        cell = replace(cell, target=str(domain.name), simulated=bool(domain.simulated))
+        if runs := found.get(key):
             lines = frame(runs, cell.entry.take)
     if kept is not None:
         done = lines.seed[lines.problem == ""].tolist() if len(lines) else []
@@ -300,35 +302,13 @@ def _filled(
     return replace(cell, runs=Runs(lines)) if len(lines) else cell
 
 
-def _known_words(cell: Cell) -> tuple[str, ...]:
-    """Without the place of runs, which is not hashed: tables of any folder share what is cached."""
-    return tuple(word for word in cell.overrides if not word.startswith("paths.log_dir="))
-
-
-class _Composed(NamedTuple):
-    """What a table has to know of a cell's config."""
-
-    experiment: str
-    hash: str
-    target: str
-    simulated: bool
-    supervised: bool
-
-
 @functools.lru_cache(maxsize=4096)
-def _composed(words: tuple[str, ...], place: str) -> _Composed:
-    """A command line of train.py, composed."""
+def _composed(words: tuple[str, ...], place: str) -> tuple[tuple[str, str], DictConfig]:
+    """Experiment and hash of a command line of train.py, and its config."""
     from qs3.config.hashing import config_hash
 
     cfg = composed("train", *words, place=place)
-    target = cfg.data.target
-    return _Composed(
-        str(cfg.experiment_name),
-        config_hash(cfg),
-        str(target.name),
-        bool(target.simulated),
-        str(cfg.method.get("_target_")).endswith(".Supervised"),
-    )
+    return (str(cfg.experiment_name), config_hash(cfg)), cfg
 
 
 def kept_lines(table: Table) -> pd.DataFrame:

@@ -83,7 +83,6 @@ def test_unfinished_and_damaged_seeds_are_shown(tmp_path):
     [
         {"data": DataHashes(source="c" * 64, target="b" * 64)},
         {"data": DataHashes(source="a" * 64, target="c" * 64)},
-        {"data": DataHashes(source="a" * 64, target="b" * 64, beside="c" * 64)},
         {"versions": {"qs3": "0.1.0", "weights": "teacher " + "c" * 64}},
     ],
 )
