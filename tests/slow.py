@@ -16,11 +16,7 @@ PATTERNS = (
     r"sweeps/test_launchers\.py::",
     # The large nets; the small ones take the same code.
     # Exports: one net in each format stays.
-    r"inference/test_export\.py::test_onnxruntime_gives_the_net_s_logits\[(?!pointnet\])",
-    r"inference/test_export\.py::test_torch_export_gives_the_net_s_logits\[(?!pointnet\])",
-    r"inference/test_export\.py::test_(the_command_and|the_example)",
     r"test_notebooks\.py::test_0",
-    r"inference/test_export\.py::test_a_net_of_one_s_own_is_exported_as_it_is",
     # What takes seconds and whose parts have tests of their own.
     r"test_api\.py::test_train_leaves_what_the_command_leaves",
     # One or two of each family stay.
@@ -37,7 +33,6 @@ PATTERNS = (
     r"sweeps/test_document\.py::test_command_composes\[python train",
     r"utils/test_pool\.py::test_processes_end_with_their_parent.*\[SIGINT",
     # What trains, renders or starts processes, and has a smaller relative in the quick run.
-    r"inference/test_export\.py::test_onnxruntime_gives",
     r"sweeps/test_search\.py::test_(the_objective_is|what_is_refused\[(?!objective)|configs_are.*optuna)",
     r"utils/test_pool\.py::test_(a_worker_that_cannot|processes_are_replaced)",
     r"datasets/frames/test_sunrgbd\.py::test_the_raw_depth",
@@ -45,17 +40,12 @@ PATTERNS = (
     r"datasets/test_ensure_source\.py::test_a_missing_source_is_made",
     r"datasets/scannet/test_extraction\.py::test_(force_starts|the_number_of_workers|an_object_that_is_nowhere)",
     r"datasets/scannet/test_masks\.py::test_a_zip_cannot",
-    r"evaluation/test_accuracy_estimates\.py::test_a_run_on_one_s_own",
     r"config/test_quoting\.py::test_every_path_of_ours",
     r"datasets/test_domain\.py::test_processes_that_open",
     r"datasets/importers/test_importers\.py::test_(kill_9|npy_header_damaged)",
-    r"inference/test_predictor\.py::test_written_is_read",
-    r"evaluation/test_ood\.py::test_limits_take",
     # What grew since: one of each family stays. Committed tables are composed by others, too.
     r"test_docs\.py::test_the_example_of_gradients",
     # What had grown since, or takes longer than the parts that stay.
-    r"inference/test_trusted\.py::test_(norms_of_each_domain_are|of_norms_that_follow)",
-    r"inference/test_draw\.py::test_a_sample_is",
 )
 
 _SLOW = re.compile("|".join(PATTERNS))

@@ -6,7 +6,8 @@ Nothing here is read by training: no model is chosen and no threshold set by the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ from torch import Tensor, nn
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
 from qs3.errors import ConfigError, DataError
-from qs3.evaluation.calibration import calibration_error
-from qs3.kernels.norms import adapt_batchnorm, use_trained
+from qs3.kernels.norms import use_trained
 from qs3.runs.metrics import PseudoLabelScores, Scores
 from qs3.runs.predictions import Predictions, read_pseudo_labels
+
+CALIBRATION_BINS = 15
 
 
 def predict(
@@ -90,39 +92,6 @@ def said_of(
     return tuple(torch.cat(each) for each in zip(*parts, strict=True))
 
 
-def adapt_norms(
-    net: nn.Module,
-    points: Float[Tensor, "n p 3"],
-    batch_size: int,
-    seed: int,
-    device: Any = "cpu",
-    *,
-    kept: float = 0.0,
-) -> None:
-    """AdaBN: give the net's batch norms the statistics of the target's training clouds (n >= 2).
-
-    One pass in random order (a dataset is sorted by class, and a batch should look like the
-    whole), in batches of about `batch_size`, as equal as they can be. The weights stay. `kept`: the
-    share of the statistics of training in the new ones, above 0 for alpha-BN.
-    """
-    batches = even_batches(points, batch_size, seed)
-    with use_trained(net, "target"):
-        adapt_batchnorm(net, (batch.to(device) for batch in batches), kept)
-
-
-def even_batches(
-    points: Float[Tensor, "n p 3"], batch_size: int, seed: int
-) -> Iterator[Float[Tensor, "b p 3"]]:
-    """All clouds in random order, in batches of about `batch_size`, as equal as they can be.
-
-    Of at least two clouds, if there are two: batch norm cannot use a single one.
-    """
-    n = len(points)
-    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
-    for index in torch.tensor_split(order, max(1, min(round(n / batch_size), n // 2))):
-        yield points[index]
-
-
 def predict_rotated(
     net: nn.Module,
     points: Float[Tensor, "n p 3"],
@@ -141,6 +110,62 @@ def rotation_average(
     """Mean of the probabilities over `rotations` turns about the up axis: by 0, 2π/n, 4π/n, ..."""
     total: Any = sum(of_turn(2 * math.pi * i / rotations) for i in range(rotations))
     return total / rotations
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Confidence against accuracy in bins ((b-1)/B, b/B] of the largest probability.
+
+    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, figure 1 and eq. 1 to 3.
+
+    Attributes:
+        count: [B] clouds in each bin.
+        confidence: [B] their mean largest probability; NaN in an empty bin.
+        accuracy: [B] the share that is right; NaN likewise.
+        error: expected calibration error in [0, 1].
+    """
+
+    count: Int[np.ndarray, " b"]
+    confidence: Float[np.ndarray, " b"]
+    accuracy: Float[np.ndarray, " b"]
+    error: float
+
+
+def reliability(
+    probabilities: Float[np.ndarray, "n c"],
+    labels: Int[np.ndarray, " n"],
+    bins: int = CALIBRATION_BINS,
+) -> Reliability | None:
+    """The diagram's figures; None if no cloud has a label. Clouds without one (-1) are left out."""
+    known = labels >= 0
+    if not known.any():
+        return None
+    probabilities, labels = probabilities[known], labels[known]
+    confidence, right = probabilities.max(axis=1), probabilities.argmax(axis=1) == labels
+    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    count = np.bincount(place, minlength=bins)
+    some = np.where(count, count, 1)
+    means = [
+        np.where(count, np.bincount(place, weights=w, minlength=bins) / some, np.nan)
+        for w in (confidence, right)
+    ]
+    gap = np.bincount(place, weights=right - confidence, minlength=bins)  # n_b (accuracy - conf.)
+    return Reliability(count, means[0], means[1], float(np.abs(gap).sum() / len(labels)))
+
+
+def calibration_error(
+    probabilities: Float[np.ndarray, "n c"],
+    labels: Int[np.ndarray, " n"],
+    bins: int = CALIBRATION_BINS,
+) -> float:
+    """Expected calibration error in [0, 1]: how far confidence is from accuracy on average.
+
+    ECE = Σ_b n_b / n |accuracy_b - confidence_b| over bins of equal width, ((b-1)/B, b/B], of the
+    largest probability (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, eq. 3).
+    """
+    found = reliability(probabilities, labels, bins)
+    assert found is not None
+    return found.error
 
 
 def scores(

@@ -2,9 +2,8 @@
 
 Five measures of a cloud, which its position, its size and a rotation about the up axis leave as
 they are (and its size and height, for nets that see these), and for each the range in which the
-training clouds of source and target lie. A cloud outside one of them is one that the classifier was
-never asked about. This guarantees nothing: a
-cloud inside all ranges can still show an object of no known class, and get a confident answer.
+training clouds of source and target lie. A cloud inside all ranges can still show an object of no
+known class, and get a confident answer.
 """
 
 from __future__ import annotations
@@ -28,25 +27,23 @@ MEASURES = {
 """Names of the measures and what they are."""
 
 OF_METRES = {"size": "largest distance of a point from the centroid, in metres"}
-"""Measured of clouds that keep their size: a net would say something of millimetres, too."""
+"""Measured of clouds that keep their size: a net would also classify millimetres."""
 
 OF_HEIGHTS = {"base": "height of its lowest point above the floor, in metres"}
 """Measured of clouds that keep their height, too: a floor in the wrong place shows here."""
-
-ALL = (*MEASURES, *OF_METRES, *OF_HEIGHTS)
-"""Names of all there are."""
 
 _TAIL = 0.001  # of the clouds of a domain, on either side
 OTHER_UNITS = "as of other units than metres"
 _NO_METRES = 10.0  # times the largest size: centimetres, millimetres or inches
 _MOST = 1000  # clouds that are measured of a domain; 3 ms each
+_LOOKED_AT = 300  # of a domain, for a share
 
 
 def measure(stored: Float[np.ndarray, "p 3"], sample: Float[np.ndarray, "m 3"]) -> dict[str, float]:
     """The `MEASURES` of a cloud.
 
     Args:
-        stored: the cloud before it was sampled; only how many different points it has is asked.
+        stored: the cloud before it was sampled; only its different points are counted.
         sample: of it, in the unit ball, z up.
     """
     different = np.unique(np.asarray(sample, dtype=np.float64), axis=0)
@@ -82,9 +79,9 @@ def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
     """The least and the largest usual value of each measure: [low, high].
 
     From 0.1 % to 99.9 % of the clouds of each domain, and of these ranges the lowest and highest
-    end. Of fewer than a thousand clouds this is about the range of all. At most `most` of a domain
-    are measured, evenly spaced. Having many points is not a fault: `points` has no upper end
-    (infinity). Its lower end is that of the clouds on disk, see `relax_min_points`.
+    end. At most `most` of a domain are measured, evenly spaced. Having many points is not a fault:
+    `points` has no upper end (infinity). Its lower end is that of the clouds on disk, see
+    `relax_min_points`.
     """
     ranges = []
     for clouds in domains:
@@ -93,8 +90,14 @@ def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
         ranges.append(np.quantile(table, [_TAIL, 1 - _TAIL], axis=0))
     low = np.min([each[0] for each in ranges], axis=0)
     high = np.max([each[1] for each in ranges], axis=0)
-    low[0], high[0] = np.floor(low[0]), np.inf  # points: of many, none is too many
+    low[0], high[0] = np.floor(low[0]), np.inf  # points
     return {name: [float(low[i]), float(high[i])] for i, name in enumerate(found[0])}
+
+
+def source_limits(source: Clouds, most: int = _MOST) -> dict[str, list[float]]:
+    """`limits` of one domain, of points no more than the net sees."""
+    seen = source.stored.shape[1] if source.order is None else source.order.shape[2]
+    return relax_min_points(limits(source, most=most), seen)
 
 
 def relax_min_points(usual: Mapping[str, list[float]], seen: int) -> dict[str, list[float]]:
@@ -123,24 +126,23 @@ def ood_reasons(measured: Mapping[str, float], usual: Mapping[str, list[float]])
 
 
 def other_units(reasons: Iterable[str]) -> str:
-    """For whoever reads the answers: clouds of whose reasons one says other units; or ""."""
+    """A warning if some of these reasons say that the clouds are not in metres; else ""."""
     count = sum(OTHER_UNITS in each for each in reasons)
-    if not count:
-        return ""
-    they = "it was" if count == 1 else "they were"
-    return (
-        f"{count} of them as large as if {they} not in metres, so these answers mean nothing: "
-        "divide millimetres by 1000, centimetres by 100 and inches by 39.37, or leave out points "
-        "far from the object"
-    )
+    return f"{count} are too large for metres: their answers mean nothing" if count else ""
 
 
 def ood_reasons_of_all(
     clouds: Clouds, usual: Mapping[str, list[float]], most: int | None = None
 ) -> list[list[str]]:
-    """What `ood_reasons` says of each cloud, or of at most `most`, evenly spaced."""
+    """`ood_reasons` of each cloud, or of at most `most`, evenly spaced."""
     found = _measured(clouds, len(clouds) if most is None else most)
     return [ood_reasons(each, usual) for each in found]
+
+
+def ood_share(clouds: Clouds, source: Clouds) -> float:
+    """The share of clouds outside the usual range of the source's, by at most 300 of each."""
+    found = ood_reasons_of_all(clouds, source_limits(source, _LOOKED_AT), most=_LOOKED_AT)
+    return sum(map(bool, found)) / len(found)
 
 
 def _measured(clouds: Clouds, most: int) -> list[dict[str, float]]:

@@ -8,25 +8,23 @@ in training and q those where the clouds come from,
 
 t = 1 is Bayes' rule for classes that look the same in both places (Saerens, Latinne, Decaestecker,
 "Adjusting the Outputs of a Classifier to New a Priori Probabilities", Neural Computation 14, 2002);
-t as a choice is Menon et al., "Long-tail learning via logit adjustment", ICLR 2021. Nothing is
-estimated here: `qs3.evaluation.share_estimates` does that, from clouds without labels.
+t as a choice is Menon et al., "Long-tail learning via logit adjustment", ICLR 2021.
+`estimate_shares` finds q from clouds without labels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.classes import CLASSES, known_as
-from qs3.config.checks import check_float
 from qs3.errors import ConfigError
 
 ESTIMATED = "estimated"
-"""In a config: shares of the target's training clouds, see `qs3.evaluation.share_estimates`."""
+"""In a config: shares of the target's training clouds, by `estimate_shares`."""
 
 POWER = 0.5
 """t: on real objects half of it is right more often than all of it (docs/how-to/predict.md)."""
@@ -36,8 +34,13 @@ ROOMS: dict[str, int] = dict(
 )
 """Objects of each class in the rooms of ScanNet10's training part (PointDA-10, Qin et al. 2019)."""
 
+TEMPERATURE = 2.0
+"""T: chosen on real objects of the part for training, with their labels."""
 
-_SHOWN = 12  # classes in words
+MORE = 5.0
+"""m: as many clouds more of each class."""
+
+_STEPS, _CLOSE = 10_000, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +48,14 @@ class Prior:
     """How much commoner classes are than in training.
 
     Attributes:
-        shares: [C] q >= 0, of sum 1.
+        shares: q >= 0 by class, of sum 1.
         power: t.
         factors: [C] >= 0, one of them above 0: (q_k / u_k)^t, the largest of them 1.
-        words: the shares, for people.
     """
 
-    shares: Float[np.ndarray, " c"]
+    shares: dict[str, float]
     power: float
     factors: Float[np.ndarray, " c"]
-    words: str
 
     def __call__(self, probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
         """The same with these classes as common.
@@ -68,12 +69,12 @@ class Prior:
         known = np.where(total > 0, weighed / np.where(total > 0, total, 1), possible)
         return np.where(np.isnan(total), np.nan, known)
 
-    def told(self, classes: Sequence[str]) -> dict[str, Any]:
-        """For a table in JSON."""
-        return {
-            "power": self.power,
-            "shares": dict(zip(classes, self.shares.tolist(), strict=True)),
-        }
+    @property
+    def words(self) -> str:
+        """The shares, the largest first."""
+        order = sorted(self.shares.items(), key=lambda pair: -pair[1])
+        shown = ", ".join(f"{name} {share:.1%}" for name, share in order)
+        return f"classes count as this common, at power {self.power:g} (prior=): {shown}"
 
 
 def read_prior(
@@ -81,45 +82,29 @@ def read_prior(
     classes: Sequence[str],
     learnt: Float[np.ndarray, " c"] | None = None,
     power: float = POWER,
-    key: str = "prior",
 ) -> Prior:
     """A prior as it is given.
 
     Args:
         given: "rooms", as in `ROOMS`; or classes and how common they are, in any unit, as
-            "chair:4,table:2,bathtub:0" or as a mapping, or as a mapping's words, such as the
-            `prior_shares` of a metrics.json: those that are not named count as 1, and 0 is never.
+            "chair:4,table:2,bathtub:0" or as a mapping, such as the `prior_shares` of a
+            metrics.json: those that are not named count as 1, and 0 is never.
         classes: that the net knows.
         learnt: u, shares of the classes in its training, each above 0; None: all alike.
         power: t >= 0.
-        key: what it is called where it is given, for messages.
 
     Raises:
         ConfigError: what is given is no such thing, or names a class that the net does not know.
     """
-    power = check_float(f"{key}_power", power, ">= 0")
-    if given == ESTIMATED:
+    try:
+        common = _common(given, classes)
+        here = np.array([common.get(name, 1.0) for name in classes], dtype=np.float64)
+        if not (power >= 0 and np.isfinite(here).all() and here.min() >= 0 and here.any()):
+            raise ValueError("needs numbers from 0 on, one of them above 0")
+    except (TypeError, ValueError, KeyError) as error:
         raise ConfigError(
-            f"{key}={ESTIMATED} is for a run, `evaluation.prior={ESTIMATED}`: there are no clouds "
-            f"to estimate shares from here. Its metrics.json has those that it found, under "
-            f"prior_shares: give them, {_example(key)}"
-        )
-    if given == "rooms":
-        given = _of_rooms(classes, key)
-    if not isinstance(given, str | Mapping):
-        raise ConfigError(f"{key}={given!r:.60} should be words or a mapping, {{'chair': 4}}")
-    pairs = _pairs(given, key) if isinstance(given, str) else list(given.items())
-    common: dict[str, float] = {}
-    for word, value in pairs:
-        name = known_as(str(word), classes)
-        if name is None:
-            raise ConfigError(f"{key}={word}: the classifier's classes are {', '.join(classes)}")
-        if name in common:
-            raise ConfigError(f"{key}= names {name} twice")
-        common[name] = check_float(f"{key}={word}", value, ">= 0")
-    here = np.array([common.get(name, 1.0) for name in classes], dtype=np.float64)
-    if not here.any():
-        raise ConfigError(f"{key}= leaves no class that there could be")
+            f"prior={given}: {error}; give rooms, or chair:4,table:2 of {', '.join(classes)}"
+        ) from None
     here /= here.max()  # sums of huge numbers are none
     shares = here / here.sum()
     if learnt is None:
@@ -128,7 +113,7 @@ def read_prior(
     log = np.log(np.where(there, shares, 1.0)) - np.log(learnt)
     log -= log[there].max()
     factors = np.where(there, np.exp(power * np.minimum(log, 0.0)), 0.0)
-    return Prior(shares, power, factors, _in_words(shares, classes, power))
+    return Prior(dict(zip(classes, shares.tolist(), strict=True)), power, factors)
 
 
 def shares_of(labels: Int[np.ndarray, " n"] | Sequence[int], classes: int) -> np.ndarray:
@@ -137,61 +122,61 @@ def shares_of(labels: Int[np.ndarray, " n"] | Sequence[int], classes: int) -> np
     return counts / counts.sum()
 
 
-def check_told(prior: object, power: float, key: str = "prior") -> None:
-    """Refuse a power that nothing reads. `key`: as of `read_prior`.
+def _common(given: str | Mapping[str, float], classes: Sequence[str]) -> dict[str, float]:
+    """How common each named class is, in any unit; a KeyError or ValueError names what is wrong."""
+    if given == "rooms":
+        return {name: float(ROOMS[name]) for name in classes}
+    if isinstance(given, str):
+        words = given.strip().removeprefix("{").removesuffix("}")
+        given = {name: float(x) for name, x in (part.rsplit(":", 1) for part in words.split(","))}
+    assert not isinstance(given, str)
+    found: dict[str, float] = {}
+    for word, value in given.items():
+        name = known_as(str(word).strip().strip("\"'"), classes)
+        if name is None or name in found:
+            raise ValueError(f"{word} is not a class, or named twice")
+        found[name] = float(value)
+    return found
 
-    Raises:
-        ConfigError: it is not `POWER`, and there is no prior.
+
+def estimate_shares(
+    probabilities: Float[np.ndarray, "n c"],
+    learnt: Float[np.ndarray, " c"],
+    temperature: float = TEMPERATURE,
+    more: float = MORE,
+) -> Float[np.ndarray, " c"]:
+    """The classes' shares among clouds without labels, by expectation maximisation.
+
+    l_ik = (p_ik / u_k)^(1/T) is how well class k explains cloud i; found are
+
+        q = argmax_q sum_i log sum_k q_k l_ik + m sum_k log q_k.
+
+    With T = 1 and m = 0 that is Saerens et al. (see the module). It takes the net at its word; of
+    real scans nets are surer than they are right, and T = 2 leaves room for that. m keeps a class
+    that is never predicted from being impossible (a Dirichlet prior).
+
+    Args:
+        probabilities: p, n >= 0. Clouds with a NaN, of a net that diverged, are left out.
+        learnt: u, each above 0, of sum 1.
+        temperature: T > 0.
+        more: m >= 0.
+
+    Returns:
+        [c] q >= 0, of sum 1, each above 0 with `more`. `learnt` where no cloud is left.
     """
-    if not prior and power != POWER:
-        raise ConfigError(
-            f"{key}_power= is for {key}=; give {key}=rooms or {_example(key)}{_or_estimated(key)}"
-        )
-
-
-def _example(key: str) -> str:
-    """As it is typed: Hydra, which reads keys with dots, takes no colons and commas."""
-    return f"'{key}={{chair: 4, table: 2}}'" if "." in key else f"{key}=chair:4,table:2"
-
-
-def _or_estimated(key: str) -> str:
-    """In a config, where there are clouds to estimate from."""
-    return f", or {ESTIMATED}" if "." in key else ""
-
-
-def _of_rooms(classes: Sequence[str], key: str) -> dict[str, float]:
-    if unknown := [name for name in classes if name not in ROOMS]:
-        raise ConfigError(
-            f"{key}=rooms knows {', '.join(ROOMS)}; the classifier also tells "
-            f"{', '.join(unknown)}: say how common they are, {_example(key)}"
-        )
-    return {name: ROOMS[name] for name in classes}
-
-
-def _pairs(words: str, key: str) -> list[tuple[str, float]]:
-    pairs: list[tuple[str, float]] = []
-    inner = words.strip()
-    inner = inner[1:-1] if inner[:1] == "{" and inner[-1:] == "}" else inner
-    for part in inner.split(","):
-        name, colon, value = part.rpartition(":")
-        name = name.strip().strip("\"'")
-        if not colon or not name.strip():
-            raise ConfigError(
-                f"{key}={words}: {part.strip()!r} should be CLASS:NUMBER, as in "
-                f"{_example(key)}; or say {key}=rooms{_or_estimated(key)}"
-            )
-        try:
-            pairs.append((name.strip(), float(value)))
-        except ValueError:
-            raise ConfigError(
-                f"{key}={words}: {value.strip()!r} after {name.strip()} should be a number"
-            ) from None
-    return pairs
-
-
-def _in_words(shares: Float[np.ndarray, " c"], classes: Sequence[str], power: float) -> str:
-    order = np.argsort(-shares, kind="stable")
-    said = ", ".join(f"{classes[k]} {shares[k]:.1%}" for k in order[:_SHOWN])
-    if len(order) > _SHOWN:
-        said += f", and {len(order) - _SHOWN} more"
-    return f"classes count as this common, at power {power:g} (prior=): {said}"
+    known = probabilities[np.isfinite(probabilities).all(axis=1)]
+    if not len(known):
+        return learnt.copy()
+    with np.errstate(divide="ignore"):
+        logs = np.log(known / learnt) / temperature
+    explains = np.exp(logs - logs.max(axis=1, keepdims=True))
+    shares = learnt.copy()
+    for _ in range(_STEPS):
+        weighed = explains * shares
+        weighed /= weighed.sum(axis=1, keepdims=True)
+        new = (weighed.sum(axis=0) + more) / (len(known) + more * len(shares))
+        done = np.abs(new - shares).max() < _CLOSE
+        shares = new
+        if done:
+            break
+    return shares

@@ -1,18 +1,36 @@
-"""What an epoch is worth without the target's labels: scores of its predictions (numpy only).
+"""Scores of an epoch without the target's labels, and which epoch is reported (numpy only).
 
-Each of `LABEL_FREE` takes the predictions for the target's training clouds, [n, K] probabilities,
-to one number in nats. `hold_out` draws the pseudo-labelled clouds that `pseudo_val` counts hits on.
-The rules by name: `selection_rules`.
+Rules of `selection.student`, by name:
+
+    last        the last epoch. Nothing is computed.
+    pseudo_val  accuracy on pseudo-labelled target clouds that were held out of the last round, as
+                in QS3's released code (there in each round; see `hold_out`).
+    entropy     three scores that need no labels at all, of the predictions for the target's
+    infomax     training clouds: [n, K] probabilities to one number in nats.
+    snd
+
+The earliest epoch wins a tie.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from qs3.errors import ConfigError
+
+LAST = "last"
+PSEUDO_VAL = "pseudo_val"
+OBJECTIVES = ("entropy", "infomax", "snd")
+"""What a search may look at: no label of the target, and the same clouds in each trial."""
+
+STUDENT_RULES = (LAST, PSEUDO_VAL, *OBJECTIVES)
 
 TEMPERATURE = 0.05
 """Temperature of the soft neighbourhood density, as in its paper and code."""
@@ -62,13 +80,12 @@ def snd(
     Neighborhood Density", ICCV 2021 (arXiv 2108.10860), there with τ = 0.05 as well.
 
     Args:
-        probabilities: rows that sum to 1.
+        probabilities: rows that sum to 1, n >= 2.
         temperature: τ > 0.
         block: rows of the similarities that are in memory at once.
     """
     n = len(probabilities)
-    if n < 2:
-        raise ValueError(f"the density of a neighbourhood needs two clouds or more, got {n}")
+    assert n > 1
     directions = probabilities / np.linalg.norm(probabilities, axis=1, keepdims=True)  # [n, K]
     total = 0.0
     for first in range(0, n, block):
@@ -140,3 +157,26 @@ def entropies(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"
     """H(p_i) = -Σ_k p_k ln p_k of each row, in nats; 0 ln 0 = 0."""
     logs = np.log(np.where(probabilities > 0, probabilities, 1.0))
     return -(probabilities * logs).sum(axis=1)
+
+
+def chosen_in_words(chosen: str) -> str:
+    """`selection.teacher` or `.student` of metrics.json for people, who count epochs from 1.
+
+    "source_val, epoch 7" is "source_val, epoch 8", as the progress of a run counts.
+    """
+    return re.sub(r"(?<=, epoch )\d+", lambda epoch: str(int(epoch[0]) + 1), chosen)
+
+
+def check_objective(objective: Any) -> None:
+    """Refuse what a search must not look at; None: there is no search.
+
+    By `pseudo_val` each trial would be judged on clouds that it selected itself.
+
+    Raises:
+        ConfigError: it is not one of `OBJECTIVES`.
+    """
+    if objective is not None and objective not in OBJECTIVES:
+        raise ConfigError(
+            f"objective={objective}: a search may not look at the target's labels, nor at clouds "
+            f"that a trial chose; set objective={'|'.join(OBJECTIVES)}"
+        )

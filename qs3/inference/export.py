@@ -1,9 +1,12 @@
-"""A trained net as one file that needs no qs3: .pt2 for `torch.export.load`, .onnx for runtimes."""
+"""A trained net as one file that needs no qs3: .pt2 for `torch.export.load`, .onnx for runtimes.
+
+Or as a folder to publish (`qs3.inference.model_file`).
+"""
 
 from __future__ import annotations
 
 import copy
-import importlib.util
+import dataclasses
 import json
 import logging
 import re
@@ -11,7 +14,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,37 +23,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.inference.judgement import read_judgement
-from qs3.inference.model_card import card, carried
+from qs3.inference.model_card import card
 from qs3.inference.model_file import (
+    CARD,
+    CONFIG,
     EXPORTED,
     PACKAGES,
+    WEIGHTS,
     build_net,
     find_result,
-    own_module,
     read_result,
-    values_of,
+    write_folder,
 )
-from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
 from qs3.inference.predictor import Predictor, load
 from qs3.kernels.norms import use_trained
 from qs3.models.base import PointClassifier
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import atomic_path, make_folder
-from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.version import VERSION
 from qs3.utils.yamls import load_yaml
 
 ALLOWED = 1e-4  # difference of logits
 ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
-SUFFIXES = EXPORTED
 INPUT, OUTPUT = "points", "logits"
 _CHECKED = 32  # clouds to compare on
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
-_MOST_CARD = 1 << 20  # bytes
-_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 _FEATURES = "qs3.models.features.features"  # a head on a file that has no place in a folder
 
 
@@ -87,171 +85,94 @@ class Comparison:
         return self.typical <= ALLOWED and self.odd <= max(1, int(ALLOWED_ODD * self.clouds))
 
     def __str__(self) -> str:
-        text = (
+        return (
             f"logits on {self.clouds} clouds differ by {self.typical:.1e} (median) and "
-            f"{self.largest:.1e} (largest)"
+            f"{self.largest:.1e} (largest); {self.odd} by more than {ALLOWED:g}"
         )
-        if self.odd:
-            text += (
-                f"; {self.odd} differ by more than {ALLOWED:g}, as where two neighbours are "
-                "equally far"
-            )
-        return text
 
 
-def export_command(
-    ckpt: str | Path,
-    out: str | Path,
-    threads: int = 1,
-    judged: str | Path = "",
-    half: bool = False,
-    packages: Sequence[str] = (),
-) -> str:
-    """Export the classifier of a run (or its result.pt) and compare; text for the terminal.
-
-    `judged`, `half` and `packages` as of `export_folder`.
-    """
-    from qs3.inference.command import saved
-
-    if not Path(out).suffix:
-        return export_folder(ckpt, Path(out).expanduser(), judged, half, packages)
-    if judged or half:
-        raise ConfigError(f"judged= and half= are for a folder; out={out} is a file")
-    before = torch.get_num_threads()
-    torch.set_num_threads(check_int("threads", threads, 1))
-    try:
-        predictor = load(ckpt, packages=(*PACKAGES, *packages))
-        replaces = Path(out).expanduser().exists()
-        compared = export(predictor, out)
-    finally:
-        torch.set_num_threads(before)  # of the whole process: sums of its next net would differ
-    how = f"onnxruntime.InferenceSession({str(out)!r})"
-    if Path(out).suffix == ".pt2":
-        how = f"torch.export.load({str(out)!r}).module()"
-    points = (
-        f"{predictor.points} (or another number of)" if any_points(predictor) else predictor.points
-    )
+def export_file(ckpt: str | Path, out: Path, packages: Sequence[str] = PACKAGES) -> str:
+    """Export the classifier of a run as an .onnx or .pt2 and compare; text for the terminal."""
+    predictor = load(ckpt, packages=packages)
+    compared = export(predictor, out)
+    points = f"{predictor.points}{' (or another number of)' if any_points(predictor) else ''}"
+    how = "onnxruntime.InferenceSession" if out.suffix == ".onnx" else "torch.export.load"
     return (
         f"{compared}\n"
-        f"{saved(out, replaces)}: {how} takes {INPUT!r}, float32 [clouds, points, 3],\n"
+        f"saved {out}: {how} reads it; it takes {INPUT!r}, float32 [clouds, points, 3],\n"
         f"any number of prepared clouds of {points} points, and gives {OUTPUT!r} of\n"
-        f"{', '.join(predictor.classes)}; NaN is not noticed"
+        f"{', '.join(predictor.classes)}"
     )
 
 
 def export_folder(
-    ckpt: str | Path,
-    folder: Path,
-    judged: str | Path = "",
-    half: bool = False,
-    packages: Sequence[str] = (),
+    ckpt: str | Path, folder: Path, half: bool = False, packages: Sequence[str] = PACKAGES
 ) -> str:
-    """Write a model's folder (see `qs3.inference.model_folder`); text for the terminal.
+    """Write a model's folder (see `qs3.inference.model_file`); text for the terminal.
 
     Args:
         ckpt: what is exported; of an exported folder its card is carried over.
         folder: where to.
-        judged: what `qs3 report judge runs=CKPT out=FILE.json` wrote, for the card; "" for none.
         half: matrices as numbers of 16 bits: half the size, and other probabilities in the fourth
             digit. They count as 32 bits again when the net is built.
-        packages: where a net of one's own is defined, beside those of qs3; the code there is run.
+        packages: where the net may be defined; the code there is run.
 
     Raises:
         ConfigError: the folder holds a README.md or config.json of something else, or the result;
             or the net needs a file that would not be in it.
-        MissingDataError, DataError: no result there, or damaged, or `judged` is not of this run.
     """
     file, result = find_result(ckpt), read_result(ckpt)
     if result.model["_target_"] == _FEATURES:
-        raise ConfigError(
-            "model=features cannot be exported: a folder would lack its backbone, which is the "
-            f"ONNX file {result.model['file']} of yours; others need result.pt, "
-            "and that file in the same place"
-        )
-    judgement = read_judgement(Path(judged).expanduser(), file) if judged else None
-    if judgement:
-        result = replace(result, worth=judgement.sentence)
-    if half:
-        result = replace(result, weights=_halved(result.weights))
-    if file.parent.resolve() == folder.resolve():
-        raise ConfigError(f"out={folder} is where it comes from; give another folder")
-    if not (folder / WEIGHTS).exists():
-        for name in (CARD, CONFIG):
-            if (folder / name).exists():
-                raise ConfigError(f"out={folder}: a {name} of something else is there; refused")
-    metrics, beside = read_metrics(file.parent), _card_beside(file)
-    if metrics is None and beside:
-        text = carried(beside, judgement)
-    else:
-        text = card(result, metrics, _command(file.parent), judgement)
-    build_net(result, (*PACKAGES, *packages))  # before anything is written
-    write_folder(folder, values_of(result), text)
-    again = read_result(folder)
-    for name in ("weights", "held_out", "trained_norms"):
-        ours, theirs = getattr(result, name) or {}, getattr(again, name) or {}
-        if ours.keys() != theirs.keys() or not all(
-            torch.equal(one, theirs[key]) for key, one in ours.items()
-        ):
-            raise Qs3Error(f"{folder} does not hold the {name} as written; is the disk sound?")
-    build_net(again, (*PACKAGES, *packages))
-    module = own_module(again)
-    named = f"; both need packages= and {module}" if module else ""
+        raise ConfigError("model=features cannot be a folder: its backbone's file is not in it")
+    others = not (folder / WEIGHTS).exists() and any((folder / x).exists() for x in (CARD, CONFIG))
+    if others or file.parent.resolve() == folder.resolve():
+        raise ConfigError(f"out={folder} holds something else; give another folder")
+    if half:  # vectors, of which running variances may be tiny, stay as they are
+        weights = {
+            name: value.half() if value.is_floating_point() and value.ndim > 1 else value
+            for name, value in result.weights.items()
+        }
+        result = dataclasses.replace(result, weights=weights)
+    metrics, beside = read_metrics(file.parent), file.with_name(CARD)
+    text = card(result, metrics, _command(file.parent))
+    if file.name == WEIGHTS and beside.is_file():
+        text = beside.read_text("utf-8")
+    build_net(result, packages)  # before anything is written
+    write_folder(folder, result, text)
+    size = (folder / WEIGHTS).stat().st_size / 1e6
     return (
-        f"saved {folder}: {WEIGHTS} ({(folder / WEIGHTS).stat().st_size / 1e6:.1f} MB), {CONFIG} "
-        f"and {CARD}\nqs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it{named}; read "
-        f"{CARD}, which is the model's card, before you publish it"
+        f"saved {folder}: {WEIGHTS} ({size:.1f} MB), {CONFIG} and {CARD}\n"
+        f"qs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it; read {CARD}, which is "
+        "the model's card, before you publish it"
     )
-
-
-def _card_beside(file: Path) -> str:
-    """The card of a folder that was exported before; "" if there is none, or it is no card."""
-    path = file.parent / CARD
-    if file.name != WEIGHTS or not path.is_file() or path.stat().st_size > _MOST_CARD:
-        return ""
-    return path.read_text("utf-8", errors="replace")
-
-
-def _halved(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Matrices in 16 bits; vectors, of which running variances may be tiny, as they are."""
-    return {
-        name: value.half() if value.is_floating_point() and value.ndim > 1 else value
-        for name, value in weights.items()
-    }
 
 
 def _command(run: Path) -> str:
     """That trained the run, if it is known; of absolute paths only the last part."""
+    path = run / ".hydra" / "overrides.yaml"
     try:
-        path = run / ".hydra" / "overrides.yaml"
-        words = load_yaml(read_whole(path, YAML_PEAK).decode(), path)
-    except (OSError, ValueError, DataError):
+        words = [str(word) for word in load_yaml(path.read_text(), path) or []]
+    except (OSError, DataError):
         return ""
-    given = [str(word) for word in words] if isinstance(words, list) else []
-    kept = [word for word in given if not word.startswith(("paths.", "hydra."))]
+    kept = [word for word in words if not word.startswith(("paths.", "hydra."))]
     return shlex.join(["qs3-train", *(re.sub(r"=[/~].*/", "=", word) for word in kept)])
 
 
 def export(
-    predictor: Predictor, out: str | Path, clouds: Float[Tensor, "n m 3"] | None = None
+    predictor: Predictor, out: Path, clouds: Float[Tensor, "n m 3"] | None = None
 ) -> Comparison:
     """Write the net to `out`, read it back, and compare it with the net, one cloud and many.
 
     `clouds`: prepared ones to compare on; None makes some up.
 
     Raises:
-        ConfigError: another kind of file, or a package for it is missing.
+        ConfigError: another kind of file.
         Qs3Error: torch cannot export this net, or the logits differ: then there is no file.
     """
-    out = Path(out).expanduser()
-    if out.suffix not in SUFFIXES:
-        raise ConfigError(
-            f"out={out} must end in {' or '.join(SUFFIXES)}, or be a folder without a dot in its "
-            "name"
-        )
-    if out.suffix == ".onnx":
-        check_packages()
+    if out.suffix not in EXPORTED:
+        raise ConfigError(f"out={out} must end in {' or '.join(EXPORTED)}, or be a folder")
     clouds = made_up(predictor.points) if clouds is None else clouds
-    # A copy that nobody trains: some operations of the graph have no gradients.
+    # A copy that is not trained: some operations of the graph have no gradients.
     net = copy.deepcopy(predictor.net).cpu().requires_grad_(False).eval()
     # Two, also where there is one: torch takes a size of 1 for one that never changes.
     example = clouds[:1].repeat(2, 1, 1)
@@ -263,8 +184,14 @@ def export(
         with atomic_path(out) as temporary:
             try:
                 run = write(net, example, predictor, temporary)
+            except ImportError as error:
+                raise ConfigError(f"{error}: pip install 'qs3[onnx]'") from error
             except Exception as error:  # torch raises dozens of kinds
-                raise _cannot(predictor, error) from error
+                cause = error.__cause__ or error
+                if isinstance(cause, Qs3Error):  # a net that knows why not
+                    raise cause from error
+                target, first = predictor.result.model["_target_"], str(cause).strip()[:200]
+                raise Qs3Error(f"torch cannot export {target}: {first}") from error
             ours = np.concatenate([net(part).numpy() for part in clouds.split(16)])
             parts = [clouds[:1], *clouds[1:].split(15)]  # the number of clouds must not matter
             theirs = np.concatenate([run(part.contiguous()) for part in parts if len(part)])
@@ -325,16 +252,6 @@ def metadata(predictor: Predictor) -> dict[str, str]:
     }
 
 
-def check_packages() -> None:
-    """Raise ConfigError if a package that writes or checks ONNX files is not installed."""
-    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ConfigError(
-            f"an .onnx file needs {', '.join(missing)}, not installed here: "
-            "pip install '.[onnx]' in the folder of qs3; out=model.pt2 needs torch alone"
-        )
-
-
 def _shapes(predictor: Predictor) -> tuple[dict[int, Any]]:
     """Which axes of the input are free."""
     free: dict[int, Any] = {0: torch.export.Dim("clouds", min=1, max=_MOST_CLOUDS)}
@@ -381,18 +298,6 @@ def _write_onnx(
         path.read_bytes(), options, providers=["CPUExecutionProvider"]
     )
     return lambda points: session.run([OUTPUT], {INPUT: points.numpy()})[0]
-
-
-def _cannot(predictor: Predictor, error: Exception) -> Qs3Error:
-    cause = error.__cause__ or error
-    if isinstance(cause, Qs3Error):  # a net that says itself why not
-        return cause
-    first = next((line for line in f"{cause}\n{error}".splitlines() if line.strip()), "")
-    return Qs3Error(
-        f"torch {torch.__version__} cannot export {predictor.result.model['_target_']}: its layers "
-        "do what a graph cannot hold, mostly work that depends on values or on the number of "
-        f"clouds ({type(cause).__name__}: {first[:200]}); use it by qs3.load"
-    )
 
 
 @contextmanager

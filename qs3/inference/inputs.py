@@ -1,4 +1,4 @@
-"""What `qs3 predict` is given: files of clouds, an archive of cut objects, or depth images.
+"""What `qs3 predict` reads: files of clouds, an archive of cut objects, or depth images.
 
 All of them become `Sample`s, one after the other; what cannot be read becomes a failed `Row`, and
 the others go on.
@@ -6,10 +6,10 @@ the others go on.
 
 from __future__ import annotations
 
-import functools
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,31 +17,30 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
-from qs3.datasets.clouds import SUFFIXES, CloudFile, parse_clouds, with_depth
+from qs3.datasets.clouds import SUFFIXES, CloudFile, npy_clouds, parse_clouds, with_depth
 from qs3.datasets.cutting import Piece, faults
 from qs3.datasets.depth_images import (
+    Intrinsics,
     check_intrinsics,
     off_centre,
     read_depth,
     read_intrinsics,
     read_mask,
 )
-from qs3.datasets.object_archive import ADAPT, JUDGE, Archive
-from qs3.datasets.pointed import RULES, Caution, Pointed, point_out
-from qs3.errors import DataError, MissingDataError, Qs3Error
+from qs3.datasets.importing import UP_AXES
+from qs3.datasets.object_archive import ADAPT, JUDGE, Archive, is_archive, read_archive
+from qs3.datasets.pointed import RULES, Caution, point_out
+from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.geometry.sampling import surface_sample
-from qs3.inference.depth_list import IMAGES, Shown
 from qs3.inference.table import Row
-from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.meshes.io import is_mesh, load_mesh
-from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
 
 ALL = "all"
 """For `part=`: every object of an archive."""
 
-Z = "z"
-_ENDINGS = 10  # of files that are passed over, by name
+_IMAGES = (".png", ".npy")
+_SEVERAL = (".npz", ".h5", ".hdf5")  # may hold several clouds, and are read to count them
 _ON_MESH = 8192  # points; nets take some of them, as far apart as can be
 
 
@@ -54,21 +53,19 @@ class Sample(NamedTuple):
         dropped: points that were left out.
         axis: that points up in it.
         picture: the depth image and the object's pixels in it; None if it comes from none.
-        drawn: whether its points were drawn on the surface of a mesh.
         world_from_camera: the rotation to z up of a cloud in the frame of its camera; None: `axis`
-            says which way is up.
+            is up.
     """
 
     name: str
     cloud: np.ndarray
     dropped: int
-    axis: str = Z
+    axis: str = "z"
     label: str = ""
     tier: str = ""
     cautions: tuple[Caution, ...] = ()
-    up: str = Z
+    up: str = "z"
     picture: tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]] | None = None
-    drawn: bool = False
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
 
     def row(self, reason: str, probabilities: np.ndarray | None) -> Row:
@@ -83,129 +80,91 @@ class Sample(NamedTuple):
             self.tier,
             self.cautions,
             self.up,
-            drawn=self.drawn,
         )
 
 
-Unit = Callable[[], Iterator[Sample | Row]]
-"""Reads one file, one depth image or one object of an archive."""
+class Unit(NamedTuple):
+    """One file, one depth image or one object of an archive: its objects, and their number.
+
+    They are counted by what is cheap to read: masks, headers of arrays.
+    """
+
+    read: Callable[[], Iterator[Sample | Row]]
+    size: Callable[[], int]
+
+
+class Inputs(NamedTuple):
+    """All units, what they are called, and what to print about them."""
+
+    units: Sequence[Unit]
+    kind: str
+    notes: Sequence[str] = ()
 
 
 def find_files(
-    place: str | Path, key: str = "input=", suffixes: Sequence[str] = SUFFIXES
+    place: Path, suffixes: Sequence[str] = SUFFIXES
 ) -> tuple[list[Path], Path, Counter[str]]:
     """The files to read, what their names are relative to, and how many of which ending it left.
 
-    In a folder: all files of known formats at any depth, in order of their names; hidden ones and
-    links to folders are left out. `key` stands before the place in messages; `suffixes` are those
-    of the formats.
+    In a folder: all files with these suffixes at any depth, in order of their names; hidden ones
+    and links to folders are left out.
 
     Raises:
         MissingDataError: nothing there.
-        DataError: one file, of an unknown format; a folder that cannot be looked into.
     """
-    place = Path(place).expanduser()
     if place.is_file():
-        if place.suffix.lower() not in suffixes:
-            hint = _instead(place.suffix.lower()) if key == "input=" else ""
-            raise DataError(f"{key}{place}: unknown format; known are {', '.join(suffixes)}{hint}")
         return [place], place.parent, Counter()
-    if not place.is_dir():
-        raise MissingDataError(f"{key}{place} is not there")
     found: list[Path] = []
     others: Counter[str] = Counter()
-    for folder, folders, names in os.walk(place, onerror=_unreadable):
+    for folder, folders, names in os.walk(place, onerror=_stop):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
-        for name in sorted(names):
-            if name.startswith("."):
-                continue
-            if (suffix := os.path.splitext(name)[1].lower()) in suffixes:
-                found.append(Path(folder) / name)
-            else:
+        for name in names:
+            suffix = os.path.splitext(name)[1].lower()
+            if suffix in suffixes and not name.startswith("."):
+                found.append(Path(folder, name))
+            elif not name.startswith("."):
                 others[suffix] += 1
     if not found:
-        raise MissingDataError(f"{key}{place} holds no file of {' '.join(suffixes)}")
+        raise MissingDataError(f"{place} holds no file of {' '.join(suffixes)}")
     return sorted(found), place, others
 
 
+def _stop(error: OSError) -> None:
+    """Stop `os.walk`, which would leave out a folder that cannot be read."""
+    raise MissingDataError(f"{error.filename} cannot be read ({error.strerror})") from error
+
+
 def passed_over(others: Mapping[str, int]) -> str:
-    """Files of kinds that are not read, by their endings; meshes with what to do."""
-    most = Counter(others).most_common()
-    shown = ", ".join(
-        f"{printable_name(suffix) or 'without ending'} {n}" for suffix, n in most[:_ENDINGS]
-    )
-    shown += ", ..." * (len(most) > _ENDINGS)
-    files = counted(sum(others.values()), "file of another kind", "files of other kinds")
-    scan = "; meshes are scanned first: qs3-generate meshes=FOLDER"
-    return f"{files} passed over: {shown}" + scan * any(suffix in MESHES for suffix in others)
+    """How many files of which endings are not read."""
+    shown = (f"{n} {printable_name(end) or 'without ending'}" for end, n in others.items())
+    return f"passed over: {', '.join(shown)}"
 
 
-def _unreadable(error: OSError) -> None:
-    """Stops `os.walk`, which would leave the folder out without a word."""
-    raise DataError(f"{error.filename} cannot be read ({error.strerror})") from error
-
-
-def _instead(suffix: str) -> str:
-    """What is done with files of another kind, for a message."""
-    if suffix in MESHES:
-        return (
-            ". A mesh is scanned first: qs3-generate meshes=FOLDER, or qs3.generate(mesh) in Python"
-        )
-    if suffix in IMAGES:
-        return ". For depth images there is depth=FILE"
-    return ". Rows of x y z are .txt or .xyz" if suffix == ".csv" else ""
-
-
-def cloud_units(files: Sequence[Path], root: Path, axis: str, classes: Sequence[str]) -> list[Unit]:
-    """One a file, named relative to `root`.
+def clouds(place: Path, up: str, part: str, classes: Sequence[str]) -> Inputs:
+    """The clouds of files, or the objects of an archive.
 
     A cloud's label is that of its file, where numbers count the classes from 0, else the nearest
-    folder below `root` that is called as a class.
+    folder below `place` that is called as a class.
     """
-    return [functools.partial(_clouds, path, root, axis, classes) for path in files]
-
-
-def archive_part(archive: Archive, part: str) -> tuple[list[int], str]:
-    """Positions of the objects of a part of an archive, and in words which part was taken.
-
-    Without a part: `adapt` where there is one, else all but `judge`, which is looked at once.
-    `part=all` takes everything.
-
-    Raises:
-        ConfigError: it has no such part.
-    """
-    parts = archive.parts
-    part = part or (ADAPT if ADAPT in parts else "")
-    if part and (part != ALL or ALL in parts):
-        chosen, taken = archive.of_part(part), f"part {part}"
-    elif part != ALL and JUDGE in parts:
-        chosen, taken = np.flatnonzero(archive.dev != JUDGE).tolist(), f"all but part {JUDGE}"
-    else:
-        chosen, taken = list(range(len(archive))), "all objects"
-    if not parts:
-        return chosen, ""
-    counts = ", ".join(f"{name} {count}" for name, count in parts.items())
-    others = f"its parts: {counts}; part=NAME or part={ALL} takes others"
-    return chosen, f"{taken} of {archive.path.name} ({others})"
-
-
-def archive_units(archive: Archive, chosen: Sequence[int], classes: Sequence[str]) -> list[Unit]:
-    """One an object of the archive, of those in `chosen`; no stray points."""
-    return [functools.partial(_object, archive, i, classes) for i in chosen]
-
-
-def depth_units(shown: Sequence[Shown], gravity: str, classes: Sequence[str]) -> list[Unit]:
-    """One a row of the list; clouds stay in the camera's frame if the net's `gravity` is "none"."""
-    return [functools.partial(_pointed, one, gravity, classes) for one in shown]
+    if up not in UP_AXES:
+        raise ConfigError(f"up={up}: give one of {' '.join(UP_AXES)}")
+    if place.is_file() and is_archive(place):
+        return _archive(read_archive(place), part, classes)
+    if (place / "manifest.csv").is_file():  # its other arrays are clouds, too
+        place = place / "points.npy"
+    files, root, others = find_files(place)
+    units = [
+        Unit(partial(_clouds, path, root, up, classes), partial(_clouds_in, path)) for path in files
+    ]
+    return Inputs(units, "file", [passed_over(others)] if others else [])
 
 
 def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
     name = printable_name(path.relative_to(root).as_posix())
     folders = [known_as(part, classes) for part in path.relative_to(root).parts[:-1]]
     folder = next((cls for cls in reversed(folders) if cls), "")
-    mesh = is_mesh(path)
     try:
-        found = CloudFile((_on_surface(path),)) if mesh else parse_clouds(path)
+        found = CloudFile((_on_surface(path),)) if is_mesh(path) else parse_clouds(path)
     except DataError as error:
         yield Row(name, None, None, reason_of(error, str(path)), None, folder)
         return
@@ -217,13 +176,41 @@ def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterat
         except DataError as error:
             yield Row(own, 0, len(given), reason_of(error, own), None, label)
             continue
-        yield Sample(own, cloud, dropped, axis, label, up=axis, drawn=mesh)
+        yield Sample(own, cloud, dropped, axis, label, up=axis)
+
+
+def _clouds_in(path: Path) -> int:
+    """How many clouds a file holds; 1 if it cannot be read."""
+    try:
+        if path.suffix.lower() == ".npy":
+            return npy_clouds(path) or 1
+        return len(parse_clouds(path).clouds) if path.suffix.lower() in _SEVERAL else 1
+    except DataError:
+        return 1
 
 
 def _on_surface(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Points on a mesh: its vertices alone lie at corners, and say little of what is between."""
+    """Points on a mesh: its vertices alone lie at corners."""
     mesh = load_mesh(path)
     return surface_sample(mesh.vertices, mesh.faces, _ON_MESH, np.random.default_rng(0))
+
+
+def _archive(archive: Archive, part: str, classes: Sequence[str]) -> Inputs:
+    """The objects of a part of an archive, without stray points.
+
+    Without a part: `adapt` where there is one, else all but `judge`, which is looked at once.
+    """
+    chosen = list(range(len(archive)))
+    part = part or (ADAPT if ADAPT in archive.parts else "")
+    if part and part != ALL:
+        chosen, taken = archive.of_part(part), f"part {part}"
+    elif not part and JUDGE in archive.parts:
+        chosen, taken = np.flatnonzero(archive.dev != JUDGE).tolist(), f"all but part {JUDGE}"
+    else:
+        taken = "all objects"
+    units = [Unit(partial(_object, archive, i, classes), partial(int, 1)) for i in chosen]
+    counts = ", ".join(f"{name} {count}" for name, count in archive.parts.items())
+    return Inputs(units, "object", [f"{taken} of {counts} (part=)"] if counts else [])
 
 
 def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sample]:
@@ -252,26 +239,74 @@ def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sa
     )
 
 
-def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
-    name, label = printable_name(shown.name), _label(shown.label, classes)
-    if shown.wrong:
-        yield Row(name, None, None, shown.wrong, None, label)
-        return
+def depth_images(
+    depth: Path,
+    mask: Path | None,
+    box: Sequence[float] | None,
+    intrinsics: str,
+    scale_m: float | None,
+    up: str,
+    gravity: str,
+) -> Inputs:
+    """The objects of one depth image, or of a folder of them.
+
+    Args:
+        depth: a file or a folder.
+        mask: likewise; those of a folder have the names of their depth images. Or:
+        box: left, top, right, bottom in pixels.
+        intrinsics: "fx,fy,cx,cy", or a file.
+        scale_m: metres a unit; None: see `qs3.datasets.depth_images`.
+        up: "x,y,z" in camera coordinates, "-y" for a level camera; "": not known.
+        gravity: of the net; "none": clouds stay in the camera's frame.
+    """
+    camera = read_intrinsics(intrinsics)
+    way = [0.0, -1.0, 0.0] if up == "-y" else [float(x) for x in up.split(",")] if up else None
+    pairs: dict[Path, Path | None] = {depth: mask}
+    if depth.is_dir():
+        if mask is None:
+            raise ConfigError(f"depth={depth} is a folder: give mask=FOLDER, masks of its names")
+        masks = {path.stem: path for path in mask.iterdir() if path.suffix.lower() in _IMAGES}
+        pairs = {path: masks.get(path.stem) for path in find_files(depth, _IMAGES)[0]}
+    units = [
+        Unit(
+            partial(_pointed, path, own, box, camera, scale_m, way, gravity),
+            partial(_objects_in, own),
+        )
+        for path, own in pairs.items()
+    ]
+    return Inputs(units, "depth image")
+
+
+def _pointed(
+    path: Path,
+    mask: Path | None,
+    box: Sequence[float] | None,
+    given: Intrinsics,
+    scale_m: float | None,
+    up: Sequence[float] | None,
+    gravity: str,
+) -> Iterator[Sample | Row]:
+    name = printable_name(path.name)
     try:
-        depth, found, unsure = _read_picture(shown)
+        depth = read_depth(path, scale_m, given.depth_scale)
+        camera = check_intrinsics(given, depth, str(path))
+        numbers = None if mask is None else read_mask(mask)
+        found = point_out(depth, camera, mask=numbers, box=box, up=up)
     except Qs3Error as error:
-        yield Row(name, None, None, reason_of(error, str(shown.depth)), None, label)
+        yield Row(name, None, None, reason_of(error, str(path)), None)
         return
+    unsure = [Caution("camera", words)] if (words := off_centre(given, depth)) else []
+    if given.bent:
+        unsure.append(Caution("lens", "the camera's distortion is known and not corrected"))
     for one in found:
         own = name + one.name
         if one.why:
-            yield Row(own, 0, one.without_depth, one.why, None, label, one.tier, up=one.up)
+            yield Row(own, 0, one.without_depth, one.why, None, tier=one.tier, up=one.up)
             continue
         yield Sample(
             own,
             one.cloud(gravity),
             one.without_depth,
-            label=label,
             tier=one.tier,
             cautions=(*one.cautions, *unsure),
             up=one.up,
@@ -280,19 +315,31 @@ def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sam
         )
 
 
-def _read_picture(
-    shown: Shown,
-) -> tuple[Float[np.ndarray, "h w"], list[Pointed], tuple[Caution, ...]]:
-    """Depth, objects, and what is not sure about the camera."""
-    given = read_intrinsics(shown.intrinsics, shown.folder)
-    depth = read_depth(shown.depth, shown.scale_m, given.depth_scale)
-    camera = check_intrinsics(given, depth, str(shown.depth))
-    mask = None if shown.mask is None else read_mask(shown.mask)
-    found = point_out(depth, camera, mask=mask, box=shown.box, up=shown.up, only=shown.only)
-    unsure = [Caution("camera", words)] if (words := off_centre(given, depth)) else []
-    if given.bent:
-        unsure.append(Caution("lens", "the camera's distortion is known and not corrected"))
-    return depth, found, tuple(unsure)
+def _objects_in(mask: Path | None) -> int:
+    """How many objects a mask marks; 1 if it cannot be read, and in a box."""
+    try:
+        return int((np.unique(read_mask(mask)) != 0).sum()) if mask else 1
+    except Qs3Error:
+        return 1
+
+
+def drawn(units: Sequence[Unit], count: int) -> list[Unit]:
+    """The same with `count` of their objects, drawn at random, always the same."""
+    sizes = [unit.size() for unit in units]
+    ends = np.cumsum(sizes)
+    chosen = np.random.default_rng(0).choice(ends[-1], min(count, ends[-1]), replace=False)
+    kept = []
+    for unit, size, end in zip(units, sizes, ends, strict=True):
+        wanted = {int(i - (end - size)) for i in chosen if end - size <= i < end}
+        if wanted:
+            kept.append(Unit(partial(_some, unit, wanted, size), partial(len, wanted)))
+    return kept
+
+
+def _some(unit: Unit, wanted: set[int], size: int) -> Iterator[Sample | Row]:
+    found = list(unit.read())
+    damaged = len(found) != size
+    yield from (one for i, one in enumerate(found) if damaged or i in wanted)
 
 
 def reason_of(error: Qs3Error, name: str) -> str:
@@ -309,9 +356,5 @@ def _label(given: object, classes: Sequence[str]) -> str:
 
 
 def printable_name(name: str) -> str:
-    """A file's name for tables, pages and terminals: bytes that are no UTF-8 become escapes.
-
-    So does what is not printable: a terminal would obey it.
-    """
-    text = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    return printable(text)
+    """A file's name for tables, pages and terminals: what is not UTF-8 or printable is escaped."""
+    return printable(name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"))

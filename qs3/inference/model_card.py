@@ -1,181 +1,116 @@
-"""The card of an exported classifier: what it is, what it was found to be worth, what it lacks."""
+"""The card of an exported classifier: what it is, how accurate it was, what it lacks."""
 
 from __future__ import annotations
 
 import math
-import re
 
-from qs3.evaluation.selection_rules import chosen_in_words
-from qs3.inference.judgement import Judgement, percent
-from qs3.inference.model_file import PACKAGES, Result, own_module
+from qs3.evaluation.validators import chosen_in_words
+from qs3.inference.model_file import PACKAGES, Result
 from qs3.runs.metrics import RunMetrics
-from qs3.utils.plural import counted
 from qs3.utils.version import VERSION
 
 _Z = 1.959964  # of a normal distribution: 95 % lie within so many standard deviations
-
-
-def card(
-    result: Result,
-    metrics: RunMetrics | None,
-    command: str = "",
-    judgement: Judgement | None = None,
-) -> str:
-    """The card as Markdown, with YAML at its top.
-
-    Args:
-        result: the classifier.
-        metrics: of its run; None if only its file is at hand: then no figures are stated.
-        command: that trained it; "" likewise.
-        judgement: what it was found to be worth on real objects; None if nobody looked.
-    """
-    net = result.model["_target_"].rpartition(".")[2]
-    title = f"{net}, {metrics.source} to {metrics.target}" if metrics else f"{net}"
-    floor = ", floor=0.0" if result.scale == "above_floor" else ""
-    own = own_module(result)
-    packages = f', packages=["{PACKAGES[0]}", "{own}"]' if own else ""
-    told = f" packages={own}" if own else ""
-    lines = [
-        "---",
-        "library_name: qs3",
-        "pipeline_tag: other",
-        "tags: [point-cloud, 3d, classification, depth-sensor, domain-adaptation]",
-        "---",
-        "",
-        f"# {title}",
-        "",
-        f"Classifies point clouds of single objects into {len(result.classes)} classes: "
-        f"{', '.join(map(_text, result.classes))}.",
-        "",
-        "```python",
-        "import qs3",
-        "",
-        f'predictor = qs3.load("this folder"{packages})',
-        f"probabilities = predictor([cloud]{floor})  # [n, 3], any n, {_frame(result)}",
-        "```",
-        "",
-        f"Or: `qs3 predict ckpt=FOLDER input=SCANS{floor.replace(',', '')}{told}`.",
-        *([f"The net is defined in {own}, which is not part of qs3."] if own else []),
-        "",
-        "## Input",
-        "",
-        f"- {_SCALE[result.scale]}",
-        f"- {_GRAVITY[result.gravity]}",
-        f"- {result.points} points, the farthest from each other, of a cloud of "
-        f"{result.stored_points}; others are thinned or filled up.",
-        "",
-        "## Training",
-        "",
-        *(_training(metrics) if metrics else ["Not recorded in the file that this was made from."]),
-        *(["", "```", command, "```"] if command else []),
-        "",
-        "## Accuracy",
-        "",
-        _accuracy(metrics),
-        "",
-        *([*_judged(judgement), ""] if judgement else []),
-        _LIMITS,
-        "",
-        "- Every object gets one of these classes, also one of no class, often with high "
-        "confidence.",
-        "- Confidence is not accuracy on clouds of another kind; `qs3 predict` marks clouds out of "
-        "the ranges of training.",
-        "- Which way is up is not guessed.",
-        "- Terms of use are those of the data above; state them when you publish this folder.",
-        "",
-        f"Written by qs3 {VERSION}.",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def carried(text: str, judgement: Judgement | None) -> str:
-    """The card of an exported classifier for its copy; a new judgement takes the place of its own.
-
-    What its run knew stands on it and nowhere else.
-    """
-    if judgement is None:
-        return text
-    before, limits, after = text.partition(_LIMITS)
-    before = before.partition(_REAL)[0].rstrip("\n")
-    return "\n".join([before, "", *_judged(judgement), "", limits + after])
-
-
-_REAL = "\nOn real objects of "
-_LIMITS = "## Limits"
 _SCALE = {
     "unit_ball": "Any unit and size: clouds are put into the unit ball.",
     "metres": "Metres: the net knows sizes.",
     "above_floor": "Metres: the net knows sizes and heights above the floor, which is given.",
 }
 _GRAVITY = {"z": "z up.", "none": "In the frame of the depth camera: x right, y down, z forward."}
+_CARD = """---
+library_name: qs3
+pipeline_tag: other
+tags: [point-cloud, 3d, classification, depth-sensor, domain-adaptation]
+---
+
+# {title}
+
+Classifies point clouds of single objects into {count} classes: {classes}.
+
+```python
+import qs3
+
+predictor = qs3.load("this folder"{packages})
+probabilities = predictor([cloud]{floor})  # [n, 3], any n
+```
+
+Or: `qs3 predict ckpt=FOLDER input=SCANS`.{own}
+
+## Input
+
+- {scale}
+- {gravity}
+- {points} points, the farthest from each other, of a cloud of {stored}; others are thinned or filled up.
+
+## Training
+
+{training}
+
+## Accuracy
+
+{accuracy}
+
+## Limits
+
+- Every object gets one of these classes, also one of no class, often with high confidence.
+- Confidence is not accuracy on clouds of another kind; `qs3 predict` marks clouds out of the ranges of training.
+- Which way is up is not guessed.
+- Terms of use are those of the data above; state them when you publish this folder.
+
+Written by qs3 {version}.
+"""  # noqa: E501
+_UNKNOWN = "Not recorded in the file that this was made from."
 
 
-def _frame(result: Result) -> str:
-    up = {"z": "z up", "none": "z forward"}[result.gravity]
-    unit = {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor: its z"}
-    return up + unit[result.scale]
+def card(result: Result, metrics: RunMetrics | None, command: str = "") -> str:
+    """The card as Markdown, with YAML at its top.
+
+    Args:
+        result: the classifier.
+        metrics: of its run; None if only its file is at hand: then there are no figures.
+        command: that trained it; "" likewise.
+    """
+    net, own = result.model["_target_"].rpartition(".")[2], result.own_module
+    training = _training(metrics) if metrics else _UNKNOWN
+    return _CARD.format(
+        title=f"{net}, {metrics.source} to {metrics.target}" if metrics else net,
+        count=len(result.classes),
+        classes=", ".join(map(_text, result.classes)),
+        packages=f', packages=["{PACKAGES[0]}", "{own}"]' if own else "",
+        floor=", floor=0.0" if result.scale == "above_floor" else "",
+        own=f" The net is defined in {own}, which is not part of qs3 (packages=)." if own else "",
+        scale=_SCALE[result.scale],
+        gravity=_GRAVITY[result.gravity],
+        points=result.points,
+        stored=result.stored_points,
+        training=training + (f"\n\n```\n{command}\n```" if command else ""),
+        accuracy=_accuracy(metrics) if metrics else _UNKNOWN,
+        version=VERSION,
+    )
 
 
-def _training(metrics: RunMetrics) -> list[str]:
-    m = metrics
-    return [
-        f"- Source, with labels: {m.source} ({m.made_of.source})",
-        f"- Target, without: {m.target_text} ({m.made_of.target})",
-        f"- Method: {m.method}; self-training: {m.selftraining}; selected by "
-        f"{chosen_in_words(m.selection.teacher)}",
-        f"- Settings: {m.hash} (SHA-256 {m.config_sha256}), seed {m.seed}",
-        f"- Data (SHA-256): source {m.data.source}, target {m.data.target}",
-        f"- Versions: {', '.join(f'{name} {version}' for name, version in m.versions.items())}",
-    ]
+def _training(m: RunMetrics) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in m.versions.items())
+    return f"""- Source, with labels: {m.source} ({m.made_of.source})
+- Target, without: {m.target_text} ({m.made_of.target})
+- Method: {m.method}; self-training: {m.selftraining}; selected by \
+{chosen_in_words(m.selection.teacher)}
+- Settings: {m.hash} (SHA-256 {m.config_sha256}), seed {m.seed}
+- Data (SHA-256): source {m.data.source}, target {m.data.target}
+- Versions: {versions}"""
 
 
-def _accuracy(metrics: RunMetrics | None) -> str:
-    if metrics is None:
-        return "Not recorded in the file that this was made from."
-    final = metrics.final
-    if final.accuracy is None:
+def _accuracy(metrics: RunMetrics) -> str:
+    final, prior = metrics.final, metrics.evaluation.prior
+    if final.accuracy is None or final.balanced_accuracy is None or final.majority_rate is None:
         return "Not known: the target has no labels."
     low, high = wilson(round(final.accuracy * final.n), final.n)
+    told = f" With `evaluation.prior`, which `qs3.load` lacks: {_text(prior)}." if prior else ""
     return (
-        f"On {counted(final.n, 'test cloud')} of {metrics.target_text}: {final.accuracy:.1%} (95 % "
-        f"interval {low:.1%} to {high:.1%} if clouds are independent), balanced "
+        f"On {final.n} test clouds of {metrics.target_text}: {final.accuracy:.1%} (95 % interval "
+        f"{low:.1%} to {high:.1%} if clouds are independent), balanced "
         f"{final.balanced_accuracy:.1%}; always the commonest class {final.majority_rate:.1%}."
-        f"{_told(metrics.evaluation.prior)}"
+        f"{told}"
     )
-
-
-def _told(prior: str) -> str:
-    """What the figures above were told, which the files beside the card do not hold."""
-    if not prior:
-        return ""
-    return (
-        f" That is with `evaluation.prior`: {_text(prior)}. Without `prior=` of `qs3.load` or "
-        "`qs3 predict`, this classifier is told nothing of the kind."
-    )
-
-
-def _judged(judgement: Judgement) -> list[str]:
-    """On real objects: a table by tier, and recalls."""
-    part = f", part {_text(judgement.part)}" if judgement.part else ""
-    every = judgement.tiers[0]
-    recalls = (
-        f"{_text(name)} {percent(value)} (of {every.counts.get(name, 0)})"
-        for name, value in every.recall.items()
-    )
-    return [
-        f"{_REAL.strip()} {_file(judgement.data)}{part}:",
-        "",
-        "| objects | number | accuracy, 95 % interval | balanced | commonest class % |",
-        "|---|---|---|---|---|",
-        *(
-            f"| {_text(one.tier)} | {one.n} | {one.accuracy} | {one.balanced} | "
-            f"{percent(one.majority)} |"
-            for one in judgement.tiers
-        ),
-        "",
-        f"Recall %: {', '.join(recalls)}.",
-    ]
 
 
 def wilson(right: int, of: int) -> tuple[float, float]:
@@ -187,10 +122,5 @@ def wilson(right: int, of: int) -> tuple[float, float]:
 
 
 def _text(name: str) -> str:
-    """A name as it stands: Markdown and HTML mean nothing in it."""
+    """A name as it is: Markdown and HTML mean nothing in it."""
     return "".join(c if c.isalnum() or c in " -" else f"&#{ord(c)};" for c in name)
-
-
-def _file(name: str) -> str:
-    """A file's name, as code where it is a usual one."""
-    return f"`{name}`" if re.fullmatch(r"[\w.-]+", name) else _text(name)

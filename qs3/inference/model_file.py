@@ -1,104 +1,62 @@
-"""`result.pt`: a run's classifier and what using it takes, as tensors and plain values.
+"""A trained classifier on disk: a run's `result.pt`, or a folder that model hubs know.
 
-A file that somebody else made is not trusted: it is read without unpickling objects, every value's
-kind is checked, and the net it asks for must be one of `qs3.models`.
+    result.pt           all of a `Result`
+    FOLDER/
+      model.safetensors   the net's weights
+      config.json         the rest of it, as plain values by name, and the weights' SHA-256
+      README.md           a card for people, with the metadata that hubs read at its top
+
+`config.json` has the form that huggingface_hub's `PyTorchModelHubMixin` passes to a class; such a
+folder can be uploaded as it is (`upload_folder`). A file that somebody else made is not trusted: it
+is read without unpickling objects, weights with another hash are refused, and the net it asks for
+must be one of `qs3.models`. Classifiers that come with qs3 are such folders, found by their names;
+none has seen a real scan.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import importlib
+import json
 import math
-import re
-import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import safetensors.torch
 import torch
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from annotated_types import Ge, Gt, Len
+from jaxtyping import Float
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.evaluation.ood import ALL as MEASURES_OF_CLOUDS
-from qs3.inference import pretrained
-from qs3.inference.held_out import checked_tensors, is_plain
-from qs3.inference.model_folder import CONFIG, WEIGHTS, read_folder
+from qs3.evaluation.expected import HeldOut
 from qs3.runs.checkpoints import load, save
-from qs3.utils.memory import check_memory
-from qs3.utils.plural import counted
+from qs3.utils.files import atomic_path, make_folder, sha256_file, write_json, write_text
+from qs3.utils.settings import problems
 from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
 
 FILE = "result.pt"
+WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 EXPORTED = (".onnx", ".pt2")
 """What `qs3 export` writes for other programs."""
 
 PACKAGES = ("qs3.models",)
 """Packages that a file may take its net from."""
 
-_TARGET = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
+PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
+ANY_SIZE, HEIGHTS, SECOND = "dgcnn-speckle", "dgcnn-rooms", "pointnet-speckle"
+"""What is used where no classifier is named: for clouds of any unit and place, for those in metres
+of which it is known where the floor is, and as a second opinion."""
+
+_HASH = "weights_sha256"
 
 
-_MOST_VALUES = 10_000  # among a net's arguments
-_ADVICE = (
-    "it is damaged, or holds more than weights and plain values, and nothing in it was run; copy "
-    "it again from where it comes from, or delete metrics.json in its run's folder and repeat the "
-    "run's command, which trains nothing again"
-)
-
-
-def _plain(values: list[Any]) -> bool:
-    """Numbers, words, None, and lists of them, not too many: what a net's arguments are."""
-    waiting, seen = [values], 0
-    while waiting:  # lists in a file may hold each other, or themselves
-        some = waiting.pop()
-        seen += len(some)
-        lists = [one for one in some if isinstance(one, list)]
-        if seen > _MOST_VALUES or not all(
-            one is None or isinstance(one, bool | int | float | str | list) for one in some
-        ):
-            return False
-        waiting += lists
-    return True
-
-
-def _model(value: dict[str, Any]) -> dict[str, Any]:
-    """A `_target_` and arguments that are plain values; no other key of Hydra's."""
-    target, odd = str(value.get("_target_")), [key for key in value if key.startswith("_")]
-    plain = _plain(list(value.values()))
-    if odd != ["_target_"] or not plain or not _TARGET.fullmatch(target):
-        raise ValueError("should be a dict with a `_target_` and plain arguments")
-    return value
-
-
-def _different(value: tuple[str, ...]) -> tuple[str, ...]:
-    if len(set(value)) < max(len(value), 2):
-        raise ValueError("should be at least two names, all different")
-    return value
-
-
-def _ranges(value: dict[str, list[float]]) -> dict[str, list[float]]:
-    odd = any(math.isnan(x) for ends in value.values() for x in ends)
-    if odd or not set(value) <= {*MEASURES_OF_CLOUDS}:
-        raise ValueError(f"should be [low, high] of {', '.join(MEASURES_OF_CLOUDS)}")
-    return value
-
-
-def _printable(value: str) -> str:
-    """It is printed on terminals."""
-    if not value.isprintable():
-        raise ValueError("should be a line of printable text")
-    return value
-
-
-_LONGEST = 1000  # characters of a sentence
-_Points = Annotated[int, Field(strict=True, ge=1, le=1 << 20)]  # more is a damaged number
-_Share = Annotated[float, Field(strict=True, gt=0, le=1)]
-_Ends = Annotated[list[Annotated[float, Field(strict=True)]], Field(min_length=2, max_length=2)]
-
-
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Result:
     """A trained classifier, not yet built. What is read from a file is checked by these types.
 
@@ -114,116 +72,126 @@ class Result:
         usual: of each measure of `qs3.evaluation.ood` the range in training, [low, high].
         weights: of the net.
         floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
-        worth: what it was found to be worth on real objects, in a sentence; "" if nobody looked.
-        held_out: what the net says of held-out labelled clouds, by which its answers to others are
-            judged; see `qs3.inference.held_out`. None in files of older versions.
-        learnt: shares of the classes in its training, by which a prior is weighed; see
-            `qs3.evaluation.prior`. None in files of older versions.
-        trained_norms: those of the weights that clouds of the target changed after training
-            (`evaluation.norms`), as training left them, by name: `held_out` is of the net with
-            these. None: nothing did, or the file is of an older version.
+        worth: accuracy on real objects, in a sentence; "" if it was not measured.
+        held_out: what it is on held-out labelled clouds, see `qs3.evaluation.expected`; None if
+            nothing is known.
+        learnt: shares of the classes in its training, see `qs3.evaluation.prior`; likewise.
     """
 
-    model: Annotated[dict[str, Any], AfterValidator(_model)]
-    classes: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], AfterValidator(_different)]
-    points: _Points
-    stored_points: _Points
+    model: dict[str, Any]
+    classes: Annotated[tuple[str, ...], Len(2)]
+    points: Annotated[int, Ge(1)]
+    stored_points: Annotated[int, Ge(1)]
     target: str
     gravity: Annotated[str, Field(pattern="^(z|none)$")]
     scale: Annotated[str, Field(pattern="^(unit_ball|metres|above_floor)$")]
-    usual: Annotated[dict[str, _Ends], AfterValidator(_ranges)]
-    weights: Annotated[dict[str, Tensor], Field(min_length=1)]
-    floor_m: Annotated[float, Field(strict=True, allow_inf_nan=False)] | None = None
-    worth: Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable)] = ""
-    held_out: Annotated[dict[str, Tensor], AfterValidator(checked_tensors)] | None = None
-    learnt: tuple[_Share, ...] | None = None
-    trained_norms: Annotated[dict[str, Tensor], Field(min_length=1)] | None = None
+    usual: dict[str, Annotated[list[float], Len(2, 2)]]
+    weights: dict[str, Tensor]
+    floor_m: float | None = None
+    worth: str = ""
+    held_out: HeldOut | None = None
+    learnt: tuple[Annotated[float, Gt(0)], ...] | None = None
 
-    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")
 
     def __repr__(self) -> str:
-        """In a line: its weights, as the dataclass has them, fill a terminal."""
-        return f"Result({self.told})"
-
-    @property
-    def before_target(self) -> Result:
-        """The same with the norms it was trained with."""
-        weights = {**self.weights, **(self.trained_norms or {})}
-        return replace(self, weights=weights, trained_norms=None)
-
-    @property
-    def told(self) -> str:
-        """Net, classes, points, scale and target, for people."""
+        """Net, classes, points, scale and target, in a line."""
         net = self.model["_target_"].rpartition(".")[2]
         return printable(
-            f"{net}, {counted(len(self.classes), 'class', 'classes')}: {', '.join(self.classes)}; "
-            f"{counted(self.points, 'point')}, scale {self.scale}, target {self.target}"
+            f"{net}, {len(self.classes)} classes: {', '.join(self.classes)}; "
+            f"{self.points} points, scale {self.scale}, target {self.target}"
         )
+
+    @property
+    def shares(self) -> Float[np.ndarray, " c"] | None:
+        """`learnt` as an array."""
+        return None if self.learnt is None else np.array(self.learnt)
+
+    @property
+    def own_module(self) -> str:
+        """Where the net is defined, of a net that is not one of qs3; else ""."""
+        module = str(self.model["_target_"]).rpartition(".")[0]
+        return "" if f"{module}.".startswith(f"{PACKAGES[0]}.") else module
+
+
+def pretrained_names() -> list[str]:
+    """Names of the classifiers that come with qs3."""
+    return sorted(path.parent.name for path in PRETRAINED.glob(f"*/{CONFIG}"))
+
+
+def pretrained_name(file: Path) -> str | None:
+    """The name of the classifier whose weights a file holds; None of other files."""
+    folder = file.resolve().parent
+    return folder.name if folder.parent == PRETRAINED else None
 
 
 def write_result(path: Path, result: Result) -> None:
     """Save it, atomically."""
-    save({"qs3": VERSION, **values_of(result)}, path)
+    save({"qs3": VERSION, **_values(result)}, path)
 
 
-def values_of(result: Result) -> dict[str, Any]:
-    """By name, as tensors and plain values."""
-    values = {field.name: getattr(result, field.name) for field in fields(result)}
-    return {**values, "classes": list(result.classes)}
+def write_folder(folder: Path, result: Result, card: str) -> None:
+    """Write the files of a folder with this card; others in it are left alone."""
+    make_folder(folder)
+    (folder / CONFIG).unlink(missing_ok=True)  # it is written last, and marks the others as whole
+    with atomic_path(folder / WEIGHTS) as path:
+        weights = {name: value.contiguous() for name, value in result.weights.items()}
+        safetensors.torch.save_file(weights, path, {"format": "pt"})
+    write_text(folder / CARD, card)
+    about = {"library_name": "qs3", "qs3": VERSION, _HASH: sha256_file(folder / WEIGHTS)}
+    plain = {name: value for name, value in _values(result).items() if name != "weights"}
+    plain["usual"] = {  # JSON has no infinity: an open end is null
+        name: [None if math.isinf(end) else end for end in ends]
+        for name, ends in result.usual.items()
+    }
+    write_json(folder / CONFIG, about | plain)
 
 
 def find_result(path: str | Path) -> Path:
-    """The file meant by the folder of a run or of an exported model, or by the file itself.
-
-    Also by the name of a classifier that comes with qs3.
+    """The file meant by a name, by the folder of a run or of an exported model, or by a file.
 
     Raises:
-        MissingDataError: there is none; says what lies there instead.
+        MissingDataError: there is none.
         ConfigError: a net that `qs3 export` wrote as one file.
     """
-    path = pretrained.folder_of(path) or Path(path).expanduser()
-    if path.suffix.lower() in EXPORTED and path.is_file():
-        raise ConfigError(
-            f"{path} is a net for other programs, without what prepares its clouds; give the run "
-            "or the classifier that it was exported from"
-        )
-    if path.is_file():
-        return path
-    if not path.is_dir():
-        own = f", or one of {', '.join(names)}" if (names := pretrained.names()) else ""
-        raise MissingDataError(f"{path} is not there; give the folder of a finished run{own}")
-    for name in (FILE, WEIGHTS):
-        if (path / name).is_file():
-            return path / name
-    if (path / "started.json").is_file():
-        raise MissingDataError(
-            f"{path} is the folder of a run that is not finished: it has no {FILE}; repeat its "
-            "command, which goes on where it stopped"
-        )
-    inside = sorted(str(file.parent) for file in path.glob(f"*/{FILE}"))
-    there = f", e.g. {inside[0]}" if inside else ""
-    raise MissingDataError(f"{path} has no {FILE}; give the folder of a finished run{there}")
+    if str(path) in pretrained_names() and not Path(path).exists():
+        path = PRETRAINED / path
+    path = Path(path).expanduser()
+    if path.suffix.lower() in EXPORTED:
+        raise ConfigError(f"{path} lacks what prepares its clouds; give what it was exported from")
+    for file in (path, path / FILE, path / WEIGHTS):
+        if file.is_file():
+            return file
+    raise MissingDataError(
+        f"{path} is not a finished run, and has no {FILE}; give its folder, or one of "
+        f"{', '.join(pretrained_names())}"
+    )
 
 
 def read_result(path: str | Path) -> Result:
-    """Read and check what `write_result` wrote, in a run's folder or file; nothing in it is run.
-
-    Also a folder of `qs3.inference.model_folder`.
+    """Read and check what `write_result` or `write_folder` wrote; nothing in it is run.
 
     Raises:
         MissingDataError: no such file.
         DataError: damaged, or not a result.
     """
     file = find_result(path)
-    if file.name == WEIGHTS:
-        return _checked(file.parent / CONFIG, read_folder(file.parent))
-    return _checked(file, load(file, advice=_ADVICE))
-
-
-def own_module(result: Result) -> str:
-    """Where the net is defined, of a net that is not one of qs3; else ""."""
-    module = str(result.model["_target_"]).rpartition(".")[0]
-    return "" if f"{module}.".startswith(f"{PACKAGES[0]}.") else module
+    if file.name != WEIGHTS:
+        return _checked(file, load(file, advice="copy it again, or repeat its run"))
+    config = file.with_name(CONFIG)
+    try:
+        values, data = json.loads(config.read_bytes()), file.read_bytes()
+        if hashlib.sha256(data).hexdigest() != values.pop(_HASH):
+            raise ValueError(f"the SHA-256 of {WEIGHTS} is not {_HASH}")
+        values["weights"] = safetensors.torch.load(data)
+        values["usual"] = {
+            name: [-math.inf if low is None else low, math.inf if high is None else high]
+            for name, (low, high) in values["usual"].items()
+        }
+        del values["library_name"]
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DataError(f"{config} or {WEIGHTS} is damaged, or of another: {error}") from error
+    return _checked(config, values)
 
 
 def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
@@ -234,102 +202,51 @@ def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
     Raises:
         DataError: a net from elsewhere, or weights that are not this net's.
     """
-    settings = dict(result.model)
-    target = settings.pop("_target_")
+    arguments = dict(result.model)
+    target = str(arguments.pop("_target_", ""))
     make = _maker(target, packages)
-    if not own_module(result):  # one's own is trusted with any arguments
-        with torch.device("meta"), warnings.catch_warnings():  # takes no memory
-            warnings.simplefilter("ignore", UserWarning)  # nothing is copied there: as is meant
-            net = _filled(make, settings, result, target)
-        values = net.state_dict().values()
-        check_memory(sum(x.numel() * x.element_size() for x in values), f"the file's {target}")
-    with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and replaced
-        return _filled(make, settings, result, target).eval()
-
-
-def _filled(make: Any, settings: dict[str, Any], result: Result, target: str) -> nn.Module:
-    """The net with its weights; DataError as of `build_net`."""
     try:
-        net = make(**settings)
-    except (
-        TypeError,
-        LookupError,
-        ValueError,
-        ArithmeticError,
-        RuntimeError,
-        ConfigError,
-    ) as error:
-        raise DataError(f"{target} cannot be built as the file says: {error}") from error
-    if not isinstance(net, nn.Module):
-        raise DataError(f"the file's model {target} is not a net; refused")
-    try:
-        net.load_state_dict(dict(result.weights))
-    except RuntimeError as error:
-        first = str(error).splitlines()[1:2] or [str(error)]
-        raise DataError(f"the file's weights are not those of {target}: {first[0].strip()}") from (
-            error
-        )
-    return net
+        with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and replaced
+            net: nn.Module = make(**arguments)
+        net.load_state_dict(result.weights)
+    except (TypeError, ValueError, RuntimeError, AttributeError, ConfigError) as error:
+        first = " ".join(str(error).split()[:40])
+        raise DataError(
+            f"the file's {target} cannot be built, or has other weights: {first}"
+        ) from (error)
+    return net.eval()
 
 
 def _maker(target: str, packages: Sequence[str]) -> Any:
     """The class or function, if it is defined in one of the packages (or modules) itself."""
     packages = (packages,) if isinstance(packages, str) else packages
-    module_name, _, name = target.rpartition(".")
-    if not any(f"{module_name}.".startswith(f"{package}.") for package in packages):
+    module, _, name = target.rpartition(".")
+    make = None
+    if any(f"{module}.".startswith(f"{package}.") for package in packages):
+        try:
+            make = getattr(importlib.import_module(module), name, None)
+        except ImportError as error:
+            raise DataError(f"the file's model {target} cannot be imported: {error}") from error
+    if not callable(make) or getattr(make, "__module__", None) != module:
         raise DataError(
-            f"the file's model is {target}, which is not in {' or '.join(packages)}; refused. "
-            "If it is a net of your own, name its package: "
-            "qs3.load(run, packages=['qs3.models', 'my_package']), or packages=my_package in a "
-            "command"
+            f"the file's model {target} is refused: it is not defined in {' or '.join(packages)}; "
+            "name the package of a net of your own, packages="
         )
-    try:
-        make = getattr(importlib.import_module(module_name), name)
-    except (ImportError, AttributeError) as error:
-        if target.startswith(f"{PACKAGES[0]}."):
-            raise DataError(f"the file's model {target} is not in this version of qs3") from error
-        raise DataError(
-            f"the file's model {target} cannot be imported here ({error}); its module must be on "
-            "the Python path: PYTHONPATH=FOLDER before the command"
-        ) from error
-    if getattr(make, "__module__", None) != module_name or not callable(make):
-        raise DataError(f"the file's model {target} is not defined there; refused")
     return make
 
 
-def _unlike(some: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> bool:
-    """Whether one has no weight of its name, size and type, or is no plain tensor."""
-    for name, one in some.items():
-        other = weights.get(name)
-        if other is None or one.dtype != other.dtype:
-            return True
-        if not (is_plain(one) and is_plain(other) and one.shape == other.shape):
-            return True
-    return False
+def _values(result: Result) -> dict[str, Any]:
+    """By name, as tensors and plain values."""
+    values = {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
+    held_out = dataclasses.asdict(result.held_out) if result.held_out else None
+    return {**values, "classes": list(result.classes), "held_out": held_out}
 
 
 def _checked(file: Path, found: Any) -> Result:
-    """The file's values as a `Result`.
-
-    Raises:
-        DataError: names the first one that is not as it should be.
-    """
+    """The file's values as a `Result`; DataError names what is wrong."""
     try:
-        result = TypeAdapter(Result).validate_python(found)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place, why = ".".join(map(str, first["loc"])) or "the file", first["msg"]
-    else:
-        if result.points > result.stored_points:
-            place, why = "points", "should be at most stored_points"
-        elif (result.scale == "above_floor") != (result.floor_m is not None):
-            place, why = "floor_m", "should be a number for scale above_floor, and for no other"
-        elif result.held_out and result.held_out["probabilities"].shape[1] != len(result.classes):
-            place, why = "held_out", "should have a probability for each class"
-        elif result.learnt is not None and len(result.learnt) != len(result.classes):
-            place, why = "learnt", "should have a share for each class"
-        elif _unlike(result.trained_norms or {}, result.weights):
-            place, why = "trained_norms", "should be some of the weights, of the same sizes"
-        else:
-            return result
-    raise DataError(f"{file} is not a result that qs3 wrote, or damaged: {place}: {why}")
+        values = {name: value for name, value in found.items() if name != "qs3"}
+        return TypeAdapter(Result).validate_python(values)
+    except (ValidationError, AttributeError) as error:
+        why = problems(error) if isinstance(error, ValidationError) else error
+        raise DataError(f"{file} is not a classifier that qs3 wrote, or damaged: {why}") from error

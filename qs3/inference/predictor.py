@@ -8,18 +8,18 @@
     objects = predictor.predict_depth(depth_m, camera, mask=mask, camera_height=1.2)
     predictor = qs3.load(run, prior="rooms")  # or prior={"chair": 4, "bathtub": 0}
 
-A cloud goes the way of the target's clouds in the run: thinned to as many points as these were
-stored with (farthest points from the first one on), or filled up by repeating its points from the
-first on; put into the unit ball, or of a net that sees metres only centred, or of one that sees
-heights put over the floor; and of it the farthest `points` points. The test clouds of a run get the
-probabilities of its predictions.csv; with `evaluation.prior` if `load` is told the same.
+A cloud goes the way of the target's clouds in the run: it is brought to as many points as these
+were stored with (`resample`); put into the unit ball, or of a net that sees metres only centred, or
+of one that sees heights put over the floor; and of it the farthest `points` points are taken. The
+test clouds of a run get the probabilities of its predictions.csv; with `evaluation.prior` if `load`
+gets the same.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,34 +28,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.config.checks import check_choice, check_int
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
-from qs3.datasets.depth_images import Pinhole
-from qs3.datasets.importing import UP_AXES, check_cloud, thinned, turned
-from qs3.datasets.pointed import Pointed
+from qs3.datasets.clouds import check_shape, checked
+from qs3.datasets.depth_images import (
+    Intrinsics,
+    Pinhole,
+    camera_of,
+    check_intrinsics,
+    check_metres,
+    off_centre,
+)
+from qs3.datasets.importing import check_cloud, thinned, turned
+from qs3.datasets.pointed import Pointed, point_out
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, other_units, relax_min_points
-from qs3.evaluation.prior import POWER, Prior, check_told, read_prior, shares_of
-from qs3.evaluation.trust import COMPARED, Known
-from qs3.inference.depth_image import DepthPrediction, objects_of
-from qs3.inference.floor import (
-    camera_is_missing,
-    check_camera_height,
-    check_floor,
-    floor_is_missing,
-)
-from qs3.inference.given_cloud import given_cloud
-from qs3.inference.held_out import known_of
+from qs3.evaluation.prior import POWER, Prior, read_prior
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.allocator import keep_freed_memory
-from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
 BATCH = 32  # clouds: more are no faster on a CPU
-DIVERGED = "the classifier's answer is no number: its training has diverged"
+DIVERGED = "the classifier's answer is not a number: its training has diverged"
+HIGHEST_M = 30.0
+"""Limit on heights in metres: a floor or a camera beyond it is in another unit."""
 
 
 class Prepared(NamedTuple):
@@ -64,15 +62,39 @@ class Prepared(NamedTuple):
     Attributes:
         points: [m, 3] about the centroid, in the unit ball or in metres; for a net that sees
             heights z is that above the floor.
-        given: how many points there were.
         strange: how it differs from the clouds of training, as text; see `qs3.evaluation.ood`.
-        measures: `qs3.evaluation.trust.COMPARED` of it.
     """
 
     points: Float[Tensor, "m 3"]
-    given: int
     strange: tuple[str, ...]
-    measures: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPrediction:
+    """A classifier's prediction for one object of a depth image.
+
+    Attributes:
+        name: "[3]", the number in the mask; "[210,95,480,430]", the box; "" of a mask of bool.
+        cls: the likeliest class; "" if nothing of the object was measured, or the classifier's
+            training has diverged.
+        confidence: its probability, in [0, 1]; NaN if there is no class.
+        probabilities: [C] float64, in the order of the predictor's classes; likewise.
+        points_m: [n, 3] float32, z up, the camera at the origin.
+        tier: "clean", "hard", or "poor": datasets leave such objects out.
+        cautions: the reasons for `tier`, and what is not sure about the picture.
+        up: how the vertical is known: "given", "planes" of the picture, or "level" camera.
+        strange: how the cloud differs from all of training's; see `qs3.evaluation.ood`.
+    """
+
+    name: str
+    cls: str
+    confidence: float
+    probabilities: Float[np.ndarray, " c"]
+    points_m: Float[np.ndarray, "n 3"]
+    tier: str
+    cautions: tuple[str, ...]
+    up: str
+    strange: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,21 +106,17 @@ class Predictor:
         result: where it comes from, and how its clouds are prepared.
         device: of the net.
         prior: how common classes are where the clouds come from; None: as in training.
-        before_target: of a net whose norms follow its target, the net with those of training, which
-            `held_out` is of; None: it is `net`.
     """
 
     net: nn.Module
     result: Result
     device: torch.device
     prior: Prior | None = None
-    before_target: nn.Module | None = None
 
     def __repr__(self) -> str:
         """In a line: net, classes, points, scale, target, device."""
-        floor = ", needs floor=" if self.needs_floor and self.camera_height is None else ""
         prior = ", with a prior" if self.prior else ""
-        return f"Predictor({self.result.told}{floor}{prior}, on {self.device})"
+        return f"Predictor({self.result}{prior}, on {self.device})"
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -109,11 +127,6 @@ class Predictor:
     def points(self) -> int:
         """Points of a cloud as the net sees it."""
         return self.result.points
-
-    @property
-    def held_out(self) -> Known | None:
-        """What the net that is `asked` says of held-out labelled clouds; None: nobody knows."""
-        return known_of(self.result.held_out) if self.result.held_out else None
 
     @property
     def in_metres(self) -> bool:
@@ -129,7 +142,7 @@ class Predictor:
     def camera_height(self) -> float | None:
         """Height of the target's camera above the floor, in metres, if it is its clouds' origin.
 
-        None: their floor is at or above the origin, so they say nothing about a camera.
+        None: their floor is at or above the origin, so they do not show a camera's height.
         """
         floor = self.result.floor_m
         return -floor if floor is not None and floor < 0 else None
@@ -148,35 +161,36 @@ class Predictor:
             name: for messages: its file.
             up: the axis that points up in it: x, y, z, -x, -y or -z.
             floor: where the floor is along that axis, in metres: minus the camera's height where
-                the camera is the origin. Nets that see heights (`needs_floor`) must be told; None:
+                the camera is the origin. Nets that see heights (`needs_floor`) need it; None:
                 as in their target, if that is a camera's (`camera_height`).
 
         Raises:
-            DataError: no points, NaN or infinite coordinates, or no cloud; says which.
-            ConfigError: `up` is no axis; `floor` is no length in metres, or nobody knows it.
+            DataError: no points, NaN or infinite coordinates, or not a cloud.
+            ConfigError: `floor` is needed, or is not in metres.
         """
-        check_choice("up", up, UP_AXES)
-        cloud = given_cloud(cloud, name)
-        # As the importer of one's own clouds, so that both ways give the same bits.
-        points = self.result.stored_points
-        stored = turned(check_cloud(thinned(cloud, points), points, name), up)
-        stored = np.ascontiguousarray(stored)  # as on disk: sums take another order otherwise
+        floor = self.floor(floor)
+        stored = resample(_given(cloud, name), self.result.stored_points, up)
         whole = stored[None]  # [1, P, 3]
-        some = self.points < points
-        order = sample(whole, self.points, 1) if some else None
-        one = Clouds.of(whole, order, self.result.scale, self._floor(floor))
+        order = sample(whole, self.points, 1) if self.points < len(stored) else None
+        one = Clouds.of(whole, order, self.result.scale, floor)
         usual = relax_min_points(self.result.usual, self.points)
-        measured = measure_one(one, 0)
-        found = ood_reasons(measured, usual)
-        compared = tuple(measured[name] for name in COMPARED)
-        return Prepared(one.all()[0], len(cloud), tuple(found), compared)
+        return Prepared(one.all()[0], tuple(ood_reasons(measure_one(one, 0), usual)))
 
-    def _floor(self, given: float | None) -> float:
-        if given is None:
-            if self.needs_floor and self.camera_height is None:
-                raise floor_is_missing()
-            return self.result.floor_m or 0.0
-        return check_floor(given)
+    def floor(self, given: float | None) -> float:
+        """Where the floor is in clouds: as given, else as in the target.
+
+        Raises:
+            ConfigError: it is needed and not known, or is not in metres.
+        """
+        if given is None and self.needs_floor and self.camera_height is None:
+            raise ConfigError(
+                "the classifier knows heights above the floor: give floor=Z, 0 if objects stand on "
+                "z = 0, or camera_height=METRES, which is floor=-METRES where the camera is the "
+                "origin"
+            )
+        if given is not None and not abs(given) < HIGHEST_M:
+            raise ConfigError(f"floor={given:g} is not where a floor is in metres")
+        return (self.result.floor_m or 0.0) if given is None else given
 
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
@@ -189,26 +203,7 @@ class Predictor:
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
     ) -> Float[np.ndarray, "n c"]:
         """The same as the net gives them."""
-        return self._said_by(self.net, points, batch_size)
-
-    def asked(
-        self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
-    ) -> Float[np.ndarray, "n c"]:
-        """The same by the net with the norms it was trained with, for a verdict by `held_out`.
-
-        Norms with the target's statistics make a net surer than it is right.
-        """
-        return self._said_by(self.before_target or self.net, points, batch_size)
-
-    def _said_by(
-        self, net: nn.Module, points: Float[Tensor, "n m 3"], batch_size: int
-    ) -> Float[np.ndarray, "n c"]:
-        found = predict(net, points, check_int("batch_size", batch_size, 1), self.device)
-        if found.shape[1] != len(self.classes):
-            raise DataError(
-                f"the net tells {found.shape[1]} classes apart, the file names {len(self.classes)}"
-            )
-        return found
+        return predict(self.net, points, batch_size, self.device)
 
     def __call__(
         self,
@@ -221,7 +216,7 @@ class Predictor:
     ) -> Float[np.ndarray, "n c"]:
         """Class probabilities of clouds, float64, a row a cloud; NaN if its training has diverged.
 
-        Of clouds that are as large as if they were in other units than the net's metres is warned.
+        Warns of clouds that are too large for the net's metres.
 
         Args:
             clouds: [N, P, 3], or a list of clouds with different numbers of points; their unit as
@@ -229,34 +224,23 @@ class Predictor:
             names: theirs, for messages; None counts them from 0.
             up: the axis that points up in them.
             floor: where the floor is in them, in metres, as in `prepare`: 0 if objects stand on
-                z = 0. A net that sees heights must be told, "dgcnn-rooms" for one.
+                z = 0. "dgcnn-rooms" needs it.
             batch_size: clouds that the net sees at a time.
 
         Raises:
-            DataError: no list of clouds, or not as many names; or names the cloud that is empty or
-                not finite.
-            ConfigError: `up` is no axis; `floor` is needed, as `prepare` says; `batch_size` is no
-                number of clouds.
+            DataError: names the cloud that is empty or not finite.
+            ConfigError: `floor` is needed, as `prepare` says.
         """
-        if clouds is None or isinstance(clouds, str | bytes) or not hasattr(clouds, "__iter__"):
-            raise DataError(f"got {clouds!r:.60}; give a list of clouds, [n, 3] arrays")
         if getattr(clouds, "ndim", 3) == 2:
-            raise DataError(
-                f"got one array of shape {tuple(clouds.shape)}; give a list of clouds, "  # type: ignore[union-attr]
-                "predictor([cloud])"
-            )
+            raise DataError("got one cloud; give a list of them, predictor([cloud])")
         arrays = list(clouds)
-        names = [f"cloud {i}" for i in range(len(arrays))] if names is None else names
-        if len(names) != len(arrays):
-            raise DataError(
-                f"names: {len(names)} of {counted(len(arrays), 'cloud')}; give each its own"
-            )
         if not arrays:
             return np.empty((0, len(self.classes)))
+        names = [f"cloud {i}" for i in range(len(arrays))] if names is None else names
         pairs = zip(arrays, names, strict=True)
         ready = [self.prepare(cloud, name, up, floor) for cloud, name in pairs]
         if words := other_units("; ".join(one.strange) for one in ready):
-            log.warning("%s: %s", counted(len(ready), "cloud"), words)
+            log.warning("of %d clouds %s", len(ready), words)
         return self.probabilities(torch.stack([one.points for one in ready]), batch_size)
 
     def predict_depth(
@@ -280,52 +264,52 @@ class Predictor:
             box: left, top, right, bottom in pixels.
             up: in the camera's frame (x right, y down, z forward), any length; None: by the planes
                 of the picture, and where it shows none, up in the picture.
-            camera_height: above the floor, in metres. Nets that see heights must be told; None:
-                as in their target, if that is a camera's.
+            camera_height: above the floor, in metres. Nets that see heights need it; None: as in
+                their target, if that is a camera's.
 
         Returns:
             In the order of the mask's numbers.
 
         Raises:
-            DataError: no depth image, a mask of another size, a box beside the picture,
-                intrinsics that cannot be the picture's, or no numbers where these are expected.
-            ConfigError: `camera_height` is no height in metres, or nobody knows it.
+            DataError: not a depth image, a mask of another size, a box outside of the picture, or
+                intrinsics that cannot be the picture's.
+            ConfigError: `camera_height` is needed, or is not in metres.
         """
-        if camera_height is None and self.needs_floor and self.camera_height is None:
-            raise camera_is_missing()
-        floor = None if camera_height is None else -check_camera_height(camera_height)
-        found, unsure = objects_of(depth_m, camera, mask=mask, box=box, up=up)
+        floor = self.floor(None if camera_height is None else -camera_height)
+        depth = _filled(depth_m)
+        if not isinstance(camera, Pinhole):
+            camera = camera_of([float(value) for value in np.ravel(camera)], "camera")
+        check_metres(depth, "the depth image")
+        check_intrinsics(given := Intrinsics(camera), depth, "the depth image")
+        unsure = [words] if (words := off_centre(given, depth)) else []
+        mask = None if mask is None else _filled(mask)
+        found = point_out(depth, camera, mask=mask, box=box, up=up)
         return [self._of_depth(one, unsure, floor) for one in found]
 
-    def _of_depth(
-        self, one: Pointed, unsure: Sequence[str], floor: float | None
-    ) -> DepthPrediction:
-        points = one.piece.points_m
-        cautions = (*(caution.words for caution in one.cautions), *unsure)
-        nothing = np.full(len(self.classes), np.nan)
+    def _of_depth(self, one: Pointed, unsure: Sequence[str], floor: float) -> DepthPrediction:
+        strange: tuple[str, ...] = ()
+        cautions = [*(caution.words for caution in one.cautions), *unsure]
+        cls, each = "", np.full(len(self.classes), np.nan)
         if one.why:
-            said = (*cautions, one.why)
-            return DepthPrediction(
-                one.name, "", float("nan"), nothing, points, one.tier, said, one.up, ()
-            )
-        ready = self.prepare(one.cloud(self.result.gravity), one.name, floor=floor)
-        (each,) = self.probabilities(ready.points[None])
-        if np.isnan(each).any():
-            said, strange = (*cautions, DIVERGED), ready.strange
-            return DepthPrediction(
-                one.name, "", float("nan"), nothing, points, one.tier, said, one.up, strange
-            )
-        best = int(each.argmax())
+            cautions.append(one.why)
+        else:
+            ready = self.prepare(one.cloud(self.result.gravity), one.name, floor=floor)
+            (each,), strange = self.probabilities(ready.points[None]), ready.strange
+            if np.isnan(each).any():
+                cautions.append(DIVERGED)
+                each = np.full(len(self.classes), np.nan)
+            else:
+                cls = self.classes[int(each.argmax())]
         return DepthPrediction(
-            one.name,
-            self.classes[best],
-            float(each[best]),
-            each,
-            points,
-            one.tier,
-            cautions,
-            one.up,
-            ready.strange,
+            name=one.name,
+            cls=cls,
+            confidence=float(each.max()),
+            probabilities=each,
+            points_m=one.piece.points_m,
+            tier=one.tier,
+            cautions=tuple(cautions),
+            up=one.up,
+            strange=strange,
         )
 
 
@@ -337,62 +321,58 @@ def load(
     prior: str | Mapping[str, float] | None = None,
     prior_power: float = POWER,
 ) -> Predictor:
-    """The classifier that a finished run reports; also as `qs3.load`.
+    """The classifier that a finished run reports; see `qs3.load`.
 
     On the CPU the process keeps the memory that predictions free from then on, as trainings do
     (`qs3.utils.allocator`): it stays as large as it was at most, and predictions are faster.
-
-    Args:
-        run: its folder, or the file result.pt of it, which needs nothing else; or a folder of
-            `qs3.inference.model_folder`; or a name of `qs3.inference.pretrained`. One that knows
-            heights (`needs_floor`) is called with floor= or camera_height=.
-        device: where to run it: "cpu", "cuda", "cuda:1".
-        packages: where the net of the file may be defined. For a net of your own add your
-            package, if you trust it to be built with any arguments.
-        prior: how common classes are where the clouds come from, "rooms" or as {"chair": 4,
-            "bathtub": 0}, those not named counting as 1; None: as in training. See
-            `qs3.evaluation.prior`.
-        prior_power: how much of that is believed; 0 nothing, 1 all.
-
-    Raises:
-        MissingDataError: no finished run there.
-        DataError: the file is damaged, or asks for something else than a net of `packages`.
-        ConfigError: no such device, or no such prior.
     """
     result = read_result(run)
-    place = device_of(device)
+    place = torch.device(device)
     if place.type == "cpu":
         keep_freed_memory()
-    check_told(prior, prior_power)
     net = build_net(result, packages).to(place)
-    before = None
-    if result.trained_norms and result.held_out:  # else there is nothing to judge by
-        before = build_net(result.before_target, packages).to(place)
-    found = Predictor(net, result, place, before_target=before)
-    if prior is None:
-        return found
-    return replace(found, prior=read_prior(prior, found.classes, learnt_of(result), prior_power))
+    given = None
+    if prior is not None:
+        given = read_prior(prior, result.classes, result.shares, prior_power)
+    return Predictor(net, result, place, given)
 
 
-def learnt_of(result: Result) -> Float[np.ndarray, " c"] | None:
-    """Shares of the classes in a classifier's training; None where its file says nothing of it."""
-    if result.learnt is not None:
-        return np.array(result.learnt)
-    if result.held_out:  # a file of an older version: those of clouds that were held out
-        return shares_of(result.held_out["labels"].numpy(), len(result.classes))
-    return None
+def resample(
+    cloud: Float[np.ndarray, "n 3"], points: int, up: str = "z"
+) -> Float[np.ndarray, "points 3"]:
+    """A cloud as the store has it: float32 [points, 3] with z up.
+
+    Of more points the farthest from the first one on are kept; fewer are repeated from the first
+    one on.
+
+    Args:
+        cloud: n >= 1.
+        points: how many it gets.
+        up: the axis that points up in it: x, y, z, -x, -y or -z.
+    """
+    found = turned(check_cloud(thinned(cloud, points), points, "the cloud"), up)
+    return np.ascontiguousarray(found)  # as on disk: sums take another order otherwise
 
 
-def device_of(device: Any) -> torch.device:
-    """The device, if it works here.
+def _given(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
+    """The x y z of an array, tensor or nested list [n, >= 3] of numbers, as float32.
 
     Raises:
-        ConfigError: it does not.
+        DataError: something else, no points, NaN, infinite or masked coordinates; or several points
+            that are (0, 0, 0), which depth cameras write where they measured nothing.
     """
-    try:
-        place = torch.device(device)
-        torch.empty(1, device=place)
-    except (RuntimeError, AssertionError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"device={device} cannot be used here ({reason}); try cpu") from error
-    return place
+    found = np.ma.asanyarray(cloud.detach().cpu() if isinstance(cloud, Tensor) else cloud)
+    if found.ndim != 2 or found.shape[1] < 3 or found.dtype.kind not in "fiu":
+        raise DataError(f"{name}: {found.dtype} {found.shape}, expected numbers [n, 3]")
+    check_shape(name, found.shape)
+    hidden = int(np.ma.getmaskarray(found)[:, :3].any(axis=1).sum())
+    found = np.asarray(found)[:, :3]
+    zeros = int((found == 0).all(axis=1).sum())
+    if hidden or zeros > 1:  # one may be a shape's own
+        raise DataError(f"{name}: {hidden or zeros} points are masked or (0, 0, 0); leave them out")
+    return checked(found, name)
+
+
+def _filled(image: Any) -> np.ndarray:
+    """The values, 0 for those that a masked array hides."""
+    return np.asarray(image.filled(0) if isinstance(image, np.ma.MaskedArray) else image)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.datasets.pointed import Caution
-from qs3.evaluation.prior import Prior
-from qs3.runs.metrics import Trust
 from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
 
@@ -23,7 +20,7 @@ COLUMNS = (
 
 
 class Row(NamedTuple):
-    """What is said of one cloud, or why nothing can be said.
+    """The prediction for one cloud, or why there is none.
 
     Attributes:
         file: relative to the input; name[3] is cloud 3 of a file that holds several, or object 3
@@ -33,15 +30,12 @@ class Row(NamedTuple):
             object's pixels without depth. None if it could not be read.
         reason: in what it is out of range, or why it failed; "" otherwise.
         probabilities: [C] float64; None if it failed.
-        label: what it is, if somebody said so: a class of the net's, or another word; "" if not.
+        label: what it is, if that is known: a class of the net's, or another word; "" if not.
         tier: of an object cut from a depth image: "clean", "hard" or "poor"; "" of other clouds.
         cautions: what was wrong when it was cut.
         up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
-        second: the class that another classifier names; "" if none was asked.
-        measures: `qs3.evaluation.trust.COMPARED` of the cloud; () if it failed.
-        asked: what a verdict is made from: `probabilities` without a prior, and with the norms the
-            net was trained with; None if it failed.
-        drawn: whether its points were drawn on the surface of a mesh.
+        second: the class that another classifier names; "" without one.
+        without_prior: as `probabilities`, with classes as common as in training.
     """
 
     file: str
@@ -54,9 +48,7 @@ class Row(NamedTuple):
     cautions: tuple[Caution, ...] = ()
     up: str = ""
     second: str = ""
-    measures: tuple[float, ...] = ()
-    asked: Float[np.ndarray, " c"] | None = None
-    drawn: bool = False
+    without_prior: Float[np.ndarray, " c"] | None = None
 
 
 def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
@@ -87,42 +79,18 @@ def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def as_csv(records: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> str:
+def as_csv(rows: Sequence[Row], classes: Sequence[str]) -> str:
     """A line each, with a column for each class."""
     lines: list[list[Any]] = [[*COLUMNS, *(f"p_{name}" for name in classes)]]
-    for one in records:
-        flag = {True: "yes", False: "no", None: None}[one["out_of_range"]]
-        cells = {**one, "out_of_range": flag}
-        each = one["probabilities"] or dict.fromkeys(classes)
+    for cells in (record(row, classes) for row in rows):
+        cells["out_of_range"] = {True: "yes", False: "no", None: None}[cells["out_of_range"]]
+        each = cells["probabilities"] or dict.fromkeys(classes)
         lines.append([*(cells[key] for key in COLUMNS), *each.values()])
     return csv_text(lines)
 
 
-def as_json(
-    records: Sequence[Mapping[str, Any]],
-    classes: Sequence[str],
-    target: str,
-    trust: Trust | None,
-    prior: Prior | None,
-    trust_without_norms: bool = False,
-) -> str:
-    """One document.
-
-    Args:
-        records: the clouds'.
-        classes: names in the order of the probabilities.
-        target: the domain that the net was adapted to.
-        trust: how many answers are expected to be right; None: cannot be told.
-        prior: how common classes counted as; None: as in training.
-        trust_without_norms: whether `trust` is of the net before its norms were its target's.
-    """
-    document = {
-        "qs3": VERSION,
-        "target": target,
-        "classes": list(classes),
-        "trust": None if trust is None else dataclasses.asdict(trust),
-        "trust_without_norms": trust_without_norms,
-        "prior": None if prior is None else prior.told(classes),
-        "clouds": records,
-    }
+def as_json(rows: Sequence[Row], classes: Sequence[str], **about: Any) -> str:
+    """One document; `about` are further values at its top."""
+    clouds = [record(row, classes) for row in rows]
+    document = {"qs3": VERSION, "classes": list(classes), **about, "clouds": clouds}
     return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

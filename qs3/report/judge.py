@@ -20,9 +20,8 @@ from jaxtyping import Int
 from qs3.classes import known_as
 from qs3.datasets.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, MissingDataError
-from qs3.inference.model_file import FILE, find_result
+from qs3.inference.model_file import FILE, find_result, pretrained_name
 from qs3.inference.predictor import Predictor, load
-from qs3.inference.pretrained import name_of
 from qs3.report.intervals import Interval, difference, share
 from qs3.runs.metrics import read_metrics
 from qs3.utils.progress import progress_bar
@@ -221,7 +220,7 @@ def _families(files: Sequence[Path]) -> list[Family]:
         seeds = tuple(sorted(of))
         runs, results = zip(*(of[seed] for seed in seeds), strict=True)
         if (first := results[0]) is None:
-            found.append(Family(name_of(runs[0]) or str(runs[0]), runs))
+            found.append(Family(pretrained_name(runs[0]) or str(runs[0]), runs))
             continue
         by = {in_words(m.versions.get("qs3", "?"), m.versions.get("commit", "")) for m in results}
         name = f"{first.experiment} {first.hash}"

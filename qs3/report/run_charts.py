@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from qs3.evaluation.calibration import CALIBRATION_BINS, reliability
+from qs3.evaluation.metrics import CALIBRATION_BINS, reliability
 from qs3.report.run_files import RunFiles
 from qs3.utils.pictures import BLUE, GREEN, GRID, INK, ORANGE, PALE_BLUE, RED, SOFT, blank
 

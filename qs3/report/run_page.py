@@ -17,8 +17,8 @@ import numpy as np
 
 from qs3.config.hydra import in_multirun
 from qs3.errors import MissingDataError, Qs3Error
-from qs3.evaluation.estimates_text import table as quality_table
-from qs3.evaluation.selection_rules import chosen_in_words
+from qs3.evaluation.expected import in_words
+from qs3.evaluation.validators import chosen_in_words
 from qs3.report import run_charts
 from qs3.report.datasets import opened_domain, part_of
 from qs3.report.run_files import RunFiles, domain_of, open_domain, read_run
@@ -112,7 +112,7 @@ def draw(
         m=m,
         teacher=m and chosen_in_words(m.selection.teacher),
         student=m and m.rounds and chosen_in_words(m.selection.student),
-        quality=m and quality_table(m.quality),
+        quality=m and _quality(m),
         confusion=m
         and m.final.confusion
         and confusion_rows(np.array(m.final.confusion), run.classes),
@@ -132,6 +132,17 @@ def draw(
     )
     write_text(out / PAGE, page)
     return Drawn(pictures, skipped, out / PAGE)
+
+
+def _quality(metrics: RunMetrics) -> list[tuple[str, str]]:
+    """What can be said of the reported net without labels of the target."""
+    found = metrics.quality
+    return [
+        ("accuracy", in_words(found.expected) or "not known"),
+        ("accuracy on held-out labelled clouds", f"{found.validation_accuracy:.1%}"),
+        ("clouds unlike the labelled ones", f"{found.unlike_source:.1%}"),
+        ("classes never predicted", ", ".join(found.never_predicted) or "none"),
+    ]
 
 
 def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | None:

@@ -88,7 +88,7 @@ def _archive(path: Path, most: int, wanted: Wanted) -> Part:
 
 
 def _files(place: Path, most: int, wanted: Wanted) -> Part:
-    files, root, _ = find_files(place, key="", suffixes=(*SUFFIXES, *MESHES))
+    files, root, _ = find_files(place, (*SUFFIXES, *MESHES))
     names = [path.relative_to(root).as_posix() for path in files]
     few = drawn(np.flatnonzero([wanted.match in name for name in names]), most)
     shown: list[Shown] = []

@@ -160,70 +160,28 @@ class StudentChoice:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
-class Estimates:
-    """Estimates of accuracy without labels; see `qs3.evaluation.accuracy_estimates`."""
-
-    validation_accuracy: float
-    temperature: float | None = None
-    mean_confidence: float | None = None
-    calibrated: float | None = None
-    thresholded: float | None = None
-    difference: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
-class Trust:
-    """How many answers are expected to be right, and why; see `qs3.evaluation.trust`.
+class Quality:
+    """What can be said of the reported net on the evaluated clouds without their labels.
 
     Attributes:
-        expected: accuracy.
-        trusted: whether it is high enough; if not, "do not trust this".
-        held_out: accuracy on held-out labelled clouds, from which it was taken down.
-        shifts: how far the clouds are from these, by name; 0 for not at all.
-        lost: what each shift took, in logits.
-        error, error_90: how far off such estimates were: on average, and nine of ten.
-    """
-
-    expected: float
-    trusted: bool
-    held_out: float
-    shifts: dict[str, float]
-    lost: dict[str, float]
-    error: float
-    error_90: float
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
-class AccuracyEstimates(Estimates):
-    """The reported net's, on the evaluated clouds.
-
-    Attributes:
-        clouds: that were judged.
-        validated_on: whose held-out labelled clouds calibrate, such as "source_val".
+        clouds: that were evaluated.
+        validated_on: whose held-out labelled clouds it was measured on, such as "source_val".
         validation_clouds: how many.
-        rotation_agreement: share of clouds with the same class after rotations about the up axis.
-        teacher_agrees: share on which the net before self-training says the same.
-        teacher: the same estimates for that net.
+        validation_accuracy: on them.
+        expected: accuracy by `qs3.evaluation.expected`, of the net before self-training if there
+            was any, with the norms it was trained with: what adapts a net to clouds makes it surer
+            of them. None of a net that has diverged, and of few clouds.
         unlike_source: share of clouds outside the usual range of the labelled ones.
         never_predicted: classes.
-        trust: what to make of it all, of the teacher's answers if there is one: a student was
-            taught to be sure of the target. With the norms that the net was trained with: the
-            target's statistics make it surer, too. None of a net that has diverged, of few clouds,
-            and in files of older versions.
-        trust_without_norms: whether that differs from the evaluated net, see `Evaluated.norms`.
-            False in files of older versions, whose verdict is of the adapted net.
     """
 
     clouds: int
     validated_on: str
     validation_clouds: int
-    rotation_agreement: float | None = None
-    teacher_agrees: float | None = None
-    teacher: Estimates | None = None
+    validation_accuracy: float
+    expected: float | None = None
     unlike_source: float
     never_predicted: list[str]
-    trust: Trust | None = None
-    trust_without_norms: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -293,7 +251,7 @@ class RunMetrics:
     rounds: list[RoundRecord] = field(default_factory=list)
     student: StudentChoice | None = None
     validators: dict[str, float | None]
-    quality: AccuracyEstimates
+    quality: Quality
     training: TrainingAccuracy | None = None
     data: DataHashes
     made_of: DataMadeOf

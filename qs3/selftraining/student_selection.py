@@ -27,8 +27,7 @@ from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
-from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
+from qs3.evaluation.validators import LABEL_FREE, LAST, PSEUDO_VAL, hold_out, is_better
 from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, class_loss
 from qs3.methods.pcm import mix, pcm_loss
@@ -54,7 +53,7 @@ class StudentSelection(Callback):
     Args:
         folder: of the run.
         phases: of the run.
-        rule: one of `selection_rules.STUDENT_RULES`.
+        rule: one of `validators.STUDENT_RULES`.
 
     Attributes:
         scores: by epoch, of those of the last round so far; none with `last`.

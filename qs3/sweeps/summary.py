@@ -21,7 +21,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.errors import ConfigError
-from qs3.evaluation.selection_rules import check_objective
+from qs3.evaluation.validators import check_objective
 from qs3.runs.metrics import METRICS
 from qs3.sweeps.search import Tried, check_varied, register, report, split
 from qs3.utils.files import make_folder

@@ -14,8 +14,7 @@ from omegaconf import OmegaConf
 
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import SelfTrainingConfig
-from qs3.evaluation.prior import ESTIMATED, Prior, read_prior, shares_of
-from qs3.evaluation.share_estimates import estimate_shares
+from qs3.evaluation.prior import ESTIMATED, Prior, estimate_shares, read_prior, shares_of
 from qs3.runs.metrics import RoundRecord
 
 Shares = Float[np.ndarray, " c"]
@@ -54,4 +53,4 @@ def prior_of(
     if given == ESTIMATED:
         given = dict(zip(classes, estimate_shares(said(), learnt).tolist(), strict=True))
     given = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
-    return read_prior(given, classes, learnt, settings.prior_power, "evaluation.prior")
+    return read_prior(given, classes, learnt, settings.prior_power)

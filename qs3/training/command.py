@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.datasets.domain import check_or_make
-from qs3.evaluation.estimates_text import in_words
-from qs3.evaluation.selection_rules import chosen_in_words
+from qs3.evaluation.expected import in_words
+from qs3.evaluation.validators import chosen_in_words
 from qs3.runs.folder import read_code
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
@@ -81,7 +81,7 @@ def headline(metrics: RunMetrics) -> str:
     target = metrics.target_text
     if final.accuracy is None:
         counts = ", ".join(f"{name} {count}" for name, count in final.predicted.items() if count)
-        estimate = in_words(metrics.quality)
+        estimate = in_words(metrics.quality.expected)
         return (
             f"{run}no labels to judge {target} by; predicted {counts}"
             f"{f'; {estimate}' if estimate else ''}; data: {metrics.data_text}{_chosen(metrics)}"

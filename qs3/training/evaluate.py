@@ -5,26 +5,24 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from qs3.datamodules.clouds import Labelled
-from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy
-from qs3.evaluation.metrics import adapt_norms, predict, predict_rotated
+from qs3.evaluation.expected import HeldOut, expected_accuracy, held_out
+from qs3.evaluation.metrics import predict, predict_rotated
+from qs3.evaluation.norms import adapt_norms, minimise_entropy
+from qs3.evaluation.ood import ood_share
 from qs3.evaluation.prior import Prior
-from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
-from qs3.evaluation.tent import minimise_entropy
-from qs3.evaluation.trust import Known
-from qs3.evaluation.validators import LABEL_FREE
-from qs3.runs.checkpoints import copy_weights, load, weights_sha256
-from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
+from qs3.evaluation.validators import LABEL_FREE, LAST, PSEUDO_VAL
+from qs3.runs.checkpoints import load, weights_sha256
+from qs3.runs.metrics import Quality, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
 from qs3.selftraining.student_selection import StudentSelection
@@ -59,10 +57,9 @@ class Outcome:
         scores: of "selected" and "last", the warm-up's epochs, and "student", the last round's.
         rotated: scores of the reported net and of "selected", averaged over rotations.
         validators: its label-free scores.
-        quality: estimates of its accuracy.
-        held_out: what it says of held-out labelled clouds, with the norms it was trained with; None
-            of one that has diverged.
-        trained_norms: those of its weights that `evaluation.norms` changed, as they were before.
+        quality: what can be said of it without labels.
+        held_out: what it is on held-out labelled clouds; None of one that has diverged, or whose
+            norms `evaluation.norms` changed.
         learnt: shares of the classes in what it learnt from.
         training: its accuracy on training clouds, with `data.clouds_a_class` alone.
     """
@@ -75,9 +72,8 @@ class Outcome:
     scores: Mapping[str, Scores]
     rotated: tuple[Scores | None, Scores | None]
     validators: dict[str, float | None]
-    quality: AccuracyEstimates
-    held_out: Known | None
-    trained_norms: dict[str, Tensor] | None
+    quality: Quality
+    held_out: HeldOut | None
     learnt: class_shares.Shares
     training: TrainingAccuracy | None
 
@@ -149,14 +145,6 @@ class SavedNets:
             )
         return self._predicted[key]
 
-    def trained_norms(self, file: Path) -> dict[str, Tensor] | None:
-        """Those of the file's weights that `evaluation.norms` changes; None: it changes none."""
-        if self.run.cfg.evaluation.norms == TRAINED:
-            return None
-        now, before = copy_weights(self(file)), copy_weights(self._net(file, TRAINED))
-        same = partial(torch.allclose, rtol=0, atol=0, equal_nan=True)
-        return {name: one for name, one in before.items() if not same(one, now[name])} or None
-
     def _net(self, file: Path, norms: str) -> nn.Module:
         key = self._weights_in(file), norms
         if key not in self._nets:
@@ -204,7 +192,6 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
 
     predictions = evaluation.predictions_of(reported(file))
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
-    quality, held_out = _quality(run, loaded, nets, file)
     return Outcome(
         net=net,
         predictions=predictions,
@@ -217,9 +204,12 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
             evaluation.rotation_averaged(partial(reported, files["selected"])),
         ),
         validators=without_labels(nets.of_target(file), choice),
-        quality=quality,
-        held_out=held_out,
-        trained_norms=nets.trained_norms(file),
+        quality=_quality(run, loaded, nets, file),
+        held_out=(
+            held_out(nets.of_validation(file), data.validation.labels.numpy())
+            if run.cfg.evaluation.norms == TRAINED
+            else None
+        ),
         learnt=learnt,
         training=(
             training_accuracy(net, data.labelled, data.owner, batch_size, device)
@@ -229,33 +219,22 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     )
 
 
-def _quality(
-    run: Run, loaded: Loaded, nets: SavedNets, file: Path
-) -> tuple[AccuracyEstimates, Known | None]:
-    def said(weights: Path, norms: str = run.cfg.evaluation.norms) -> Said:
-        return Said(
-            validation=nets.of_validation(weights, norms),
-            target=nets.of_test(weights, norms=norms),
-        )
-
-    data, rounds = loaded.data, run.scheme.rounds
-    first = run.folder / WARMUP_SELECTED if rounds else file
-    adapted = run.cfg.evaluation.norms != TRAINED
-    quality, held_out = estimate_accuracy(
-        said(file),
-        data.validation.labels.numpy(),
-        loaded.evaluation.test.clouds,
-        data.all_labelled,
-        owner=data.owner,
-        classes=loaded.evaluation.classes,
-        teacher=said(first) if rounds else None,
-        asked=said(first, TRAINED) if rounds or adapted else None,
-        turned=partial(nets.of_test, file) if run.target.gravity == "z" else None,
+def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
+    data, classes = loaded.data, loaded.evaluation.classes
+    labels, table = data.validation.labels.numpy(), nets.of_test(file)
+    # What adapts a net to these clouds makes it surer of them than it is right.
+    before = run.folder / WARMUP_SELECTED if run.scheme.rounds else file
+    known = held_out(nets.of_validation(before, TRAINED), labels)
+    counts = np.bincount(table.argmax(axis=1), minlength=len(classes))
+    return Quality(
+        clouds=len(table),
+        validated_on=f"{data.owner}_val",
+        validation_clouds=len(labels),
+        validation_accuracy=float((nets.of_validation(file).argmax(axis=1) == labels).mean()),
+        expected=expected_accuracy(known, nets.of_test(before, norms=TRAINED)),
+        unlike_source=ood_share(loaded.evaluation.test.clouds, data.all_labelled),
+        never_predicted=[name for name, n in zip(classes, counts, strict=True) if not n],
     )
-    if adapted and held_out is not None:  # the verdict by the file is asked of that net
-        trained = nets.of_validation(file, TRAINED)
-        held_out = replace(held_out, probabilities=trained) if np.isfinite(trained).all() else None
-    return replace(quality, trust_without_norms=adapted and quality.trust is not None), held_out
 
 
 def without_labels(

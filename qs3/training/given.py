@@ -15,7 +15,6 @@ from torch import Tensor
 
 from qs3.errors import ConfigError
 from qs3.inference.model_file import read_result
-from qs3.inference.predictor import learnt_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ def read_given(cfg: DictConfig) -> Given | None:
         key: value.float() if value.is_floating_point() else value
         for key, value in result.weights.items()
     }
-    return Given(name, result.classes, weights, _sha256(weights), learnt_of(result))
+    return Given(name, result.classes, weights, _sha256(weights), result.shares)
 
 
 def _sha256(weights: Mapping[str, Tensor]) -> str:

@@ -11,10 +11,8 @@ from omegaconf import OmegaConf
 
 from qs3.config import hashing
 from qs3.config.hydra import component_names
-from qs3.evaluation.accuracy_estimates import source_ranges
-from qs3.evaluation.ood import limits, ood_reasons_of_all
-from qs3.evaluation.selection_rules import LAST
-from qs3.inference.held_out import tensors_of
+from qs3.evaluation.ood import limits, ood_reasons_of_all, source_limits
+from qs3.evaluation.validators import LAST
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result
 from qs3.runs.checkpoints import copy_weights
@@ -84,9 +82,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
             rotations=evaluation.rotations,
             norms=cfg.evaluation.norms,
             prior=outcome.prior.words if outcome.prior else "",
-            prior_shares=outcome.prior.told(evaluation.classes)["shares"]
-            if outcome.prior
-            else None,
+            prior_shares=outcome.prior.shares if outcome.prior else None,
             final_over_rotations=over,
             warmup_over_rotations=before,
             tiers=evaluation.scores_of_tiers(outcome.predictions.probabilities),
@@ -160,9 +156,8 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         usual=limits(loaded.data.all_labelled, loaded.data.target.clouds),
         weights=copy_weights(outcome.net),
         floor_m=_floor(run),
-        held_out=tensors_of(outcome.held_out) if outcome.held_out else None,
+        held_out=outcome.held_out,
         learnt=tuple(outcome.learnt.tolist()),
-        trained_norms=outcome.trained_norms,
     )
 
 
@@ -176,7 +171,7 @@ def _write_of_files(run: Run, loaded: Loaded, outcome: Outcome) -> None:
     rows = read_manifest(run.target.folder, loaded.evaluation.classes)
     origins = {row.id: row.origin for row in rows if row.origin}
     test = loaded.evaluation.test
-    strange = ood_reasons_of_all(test.clouds, source_ranges(loaded.data.all_labelled))
+    strange = ood_reasons_of_all(test.clouds, source_limits(loaded.data.all_labelled))
     write_predictions_of_files(
         run.folder / OF_FILES,
         [origins.get(id_, id_) for id_ in test.ids],

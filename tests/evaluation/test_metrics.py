@@ -9,11 +9,12 @@ from torch import nn
 
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
-from qs3.evaluation.calibration import calibration_error, reliability
 from qs3.evaluation.metrics import (
     Evaluation,
+    calibration_error,
     predict,
     predict_rotated,
+    reliability,
     rotation_average,
     scores,
 )

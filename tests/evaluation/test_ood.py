@@ -68,6 +68,7 @@ def domain(rng: np.random.Generator, count: int, scale: tuple[float, float, floa
     return prepare(clouds.astype(np.float32), 64)
 
 
+@pytest.mark.slow
 def test_limits_take_the_wider_end_of_each_domain():
     rng = np.random.default_rng(0)
     low, tall = domain(rng, 300, (1, 1, 0.3)), domain(rng, 300, (1, 1, 3))

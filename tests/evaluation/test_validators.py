@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.evaluation.validators import (
     LABEL_FREE,
     entropy,
@@ -91,11 +90,6 @@ def test_snd_looks_at_directions():
     p = e / e.sum()
     first = -(p * np.log(p)).sum()
     assert snd(table) == pytest.approx((2 * first + math.log(2)) / 3)
-
-
-def test_no_neighbour():
-    with pytest.raises(ValueError, match="two clouds or more, got 1"):
-        snd(UNSURE[:1])
 
 
 # --- twin and properties -----------------------------------------------------------------------
@@ -194,7 +188,3 @@ def test_another_seed_holds_others_out():
     assert (hold_out(y, ids, 3) != hold_out(y, ids, 4)).any()
     confident = np.flatnonzero(hold_out(y, ids, 3))
     assert confident.min() < 50 < confident.max()  # not only from one end
-
-
-def test_every_rule_has_a_name_and_every_score_a_rule():
-    assert ("last", "pseudo_val", *LABEL_FREE) == STUDENT_RULES

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from qs3.inference.model_file import read_result, write_result
 from qs3.inference.predictor import Predictor
 from qs3.training.command import train
 from tests.composing import compose
+from tests.running import main
 from tests.training.toy import write_toy
 
 
@@ -33,12 +35,6 @@ def metric_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     """The same on clouds that keep their size."""
     metres = ("data.scale=metres", "data.source.unit=metres")
     return trained(data_dir, tmp_path_factory.mktemp("metric"), *metres)
-
-
-@pytest.fixture(scope="session")
-def adapted_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The net of `run` with the norms' statistics of its target."""
-    return trained(data_dir, tmp_path_factory.mktemp("adapted"), "evaluation.norms=adabn")
 
 
 @pytest.fixture
@@ -72,3 +68,17 @@ def trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
     cfg = compose("train", [*overrides_of(data_dir, log_dir), *more])
     train(cfg)
     return hashing.run_folder(cfg)
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    """Rows of a table of predictions."""
+    with open(path, encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def probabilities(row: dict[str, str]) -> list[float]:
+    return [float(value) for key, value in row.items() if key.startswith("p_")]
+
+
+def predict(run: str | Path, out: Path, *more: str) -> int:
+    return main(["predict", f"ckpt={run}", f"out={out}", "threads=2", *more])

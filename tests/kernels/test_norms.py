@@ -6,7 +6,8 @@ import torch
 from torch import nn
 
 from qs3.errors import ConfigError
-from qs3.evaluation.metrics import adapt_norms, predict
+from qs3.evaluation.metrics import predict
+from qs3.evaluation.norms import adapt_norms
 from qs3.kernels.norms import (
     DomainNorm,
     adapt_batchnorm,

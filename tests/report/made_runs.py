@@ -6,12 +6,12 @@ from dataclasses import replace
 import matplotlib.image
 
 from qs3.runs.metrics import (
-    AccuracyEstimates,
     DataHashes,
     DataMadeOf,
     EpochScores,
     Evaluated,
     Loading,
+    Quality,
     RunMetrics,
     Scores,
     Selection,
@@ -58,7 +58,7 @@ def metrics(seed=0, accuracy=0.5, **changes):
         ),
         "warmup": Warmup(selected=before, last=before),
         "validators": {"infomax": 0.5},
-        "quality": AccuracyEstimates(
+        "quality": Quality(
             validation_accuracy=0.9,
             clouds=200,
             validated_on="source_val",

@@ -18,8 +18,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
-from qs3.evaluation.selection_rules import OBJECTIVES, check_objective
-from qs3.evaluation.validators import LABEL_FREE
+from qs3.evaluation.validators import LABEL_FREE, OBJECTIVES, check_objective
 from qs3.sweeps.search import Tried, check_varied, distribution, report, split, words
 from qs3.training.command import judged, objective_of, train
 from qs3.utils.locks import alone

@@ -16,7 +16,7 @@ import torch
 
 from qs3.config import hashing
 from qs3.datamodules.clouds import load_clouds
-from qs3.evaluation.tent import minimise_entropy
+from qs3.evaluation.norms import minimise_entropy
 from qs3.runs.checkpoints import load
 from qs3.store.store import open_pointset
 from qs3.training.command import train

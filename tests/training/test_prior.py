@@ -10,8 +10,7 @@ import pytest
 import qs3
 from qs3.config import hashing
 from qs3.errors import ConfigError
-from qs3.evaluation.prior import read_prior
-from qs3.evaluation.share_estimates import estimate_shares
+from qs3.evaluation.prior import estimate_shares, read_prior
 from qs3.inference.model_file import read_result
 from qs3.runs.metrics import read_metrics
 from qs3.runs.predictions import read_predictions

@@ -20,8 +20,7 @@ from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.selection_rules import STUDENT_RULES
-from qs3.evaluation.validators import LABEL_FREE
+from qs3.evaluation.validators import LABEL_FREE, STUDENT_RULES
 from qs3.runs.checkpoints import copy_weights, load
 from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.runs.predictions import read_pseudo_labels

@@ -15,7 +15,7 @@ import torch
 from qs3.datamodules.splits import RULES
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import Evaluation
-from qs3.evaluation.selection_rules import STUDENT_RULES
+from qs3.evaluation.validators import STUDENT_RULES
 from qs3.store.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.training.command import train
 from tests.training.search import Truth, search

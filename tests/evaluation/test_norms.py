@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from qs3.evaluation.metrics import adapt_norms
-from qs3.evaluation.tent import RATE, entropy, minimise_entropy
+from qs3.evaluation.norms import RATE, adapt_norms, entropy, minimise_entropy
 from qs3.kernels.norms import use_domain
 from qs3.methods.bounds import SourceOnly
 from qs3.models.base import ClassHead, PointClassifier
