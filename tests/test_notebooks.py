@@ -92,7 +92,7 @@ def test_01_sensor():
 
 def test_02_qbst():
     done = run("02_qbst", ROOT)  # from the root as well as from notebooks/
-    assert len(images(done)) == 3
+    assert len(images(done)) == 2
     text = printed(done)
     found = re.findall(r"teacher (\d+\.\d)%, student from scratch (\d+\.\d)%", text)
     (teacher, qbst), (_, every) = [[float(x) for x in pair] for pair in found]

@@ -168,7 +168,9 @@ def sheet(
         write(left + (column + 0.5) * side, tops[0] - 0.2 * _DPI, words, 8, INK)
     write(wide / 2, 0.24 * _DPI, heading, 11, INK, weight="bold")
     write(wide / 2, high - 0.14 * _DPI, note, 8, SOFT)
-    figure.figimage(canvas, zorder=-1)
+    axes = figure.add_axes((0, 0, 1, 1))  # not figimage: notebooks show no figure without axes
+    axes.set_axis_off()
+    axes.imshow(canvas, aspect="auto", interpolation="nearest")
     return figure
 
 
