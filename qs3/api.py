@@ -43,7 +43,6 @@ def train(*overrides: str) -> Path:
     from qs3.training.run import run_of
     from qs3.utils.files import write_text
 
-    _check_words(overrides)
     if any(word.lstrip("+").startswith("hparams_search=") for word in overrides):
         raise ConfigError("hparams_search= is many runs: search with python train.py, or qs3-train")
     with _as_hydra("train", overrides) as cfg:
@@ -91,7 +90,6 @@ def generate(*arguments: Any) -> Any:
         RenderError: the renderer cannot be used here.
     """
     of_meshes = bool(arguments) and not isinstance(arguments[0], str)
-    _check_words(arguments[of_meshes:])
     if not of_meshes:
         from qs3.generation.command import generate as made
 
@@ -124,9 +122,8 @@ def load(
         found = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
 
     A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`). One that
-    knows sizes and heights, as "dgcnn-rooms" (`predictor.needs_floor`), takes metres and must be
-    told where the floor is: `predictor(clouds, floor=0.0)`, z of the floor, and
-    `predictor.predict_depth(..., camera_height=1.2)`.
+    knows sizes and heights, as "dgcnn-rooms" (`predictor.needs_floor`), takes metres and needs the
+    floor: `predictor(clouds, floor=0.0)`, `predictor.predict_depth(..., camera_height=1.2)`.
 
     Args:
         run: its folder, or the file result.pt of it, which needs nothing beside it; or a folder
@@ -151,17 +148,6 @@ def load(
     from qs3.inference.predictor import load as load_result
 
     return load_result(run, device=device, packages=packages, prior=prior, prior_power=prior_power)
-
-
-def _check_words(words: Sequence[Any]) -> None:
-    """Raise ConfigError for the first that is no text, such as a list of them."""
-    from qs3.errors import ConfigError
-
-    if wrong := [word for word in words if not isinstance(word, str)]:
-        raise ConfigError(
-            f'{wrong[0]!r} is no word: each is a text of its own, such as "seed=1"; those of a '
-            "list are given with *words"
-        )
 
 
 @contextlib.contextmanager
