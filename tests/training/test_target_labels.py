@@ -134,7 +134,7 @@ def test_no_target_label_within_reach(toy, tmp_path, watch, settings, class_in_i
     assert metrics.final.accuracy < 1  # else pseudo-labels would be the labels
     assert watch.planted == [True]
     # What a cloud is called may tell its class. No batch and no loss holds a name.
-    names = {path for path in watch.found if path.endswith("ids: train labels")}
+    names = {path for path in watch.found if path.endswith("names: train labels")}
     assert watch.found == names
     assert bool(names) == class_in_id
     rounds = "selftraining=none" not in settings
