@@ -91,8 +91,6 @@ def _dispatch(commands: Commands, argv: list[str], name: str, about: str) -> int
     if not isinstance(found, str):
         return _dispatch(found, rest, name, "")
     function = _function(found)
-    if not inspect.isfunction(function):  # a command of `qs3.utils.cli`, until the last is gone
-        return function(rest)
     if {*_HELP[:2]} & {*rest} or rest == ["help"]:
         print(_help(function, name))
         return 0
@@ -212,10 +210,7 @@ def _function(where: str) -> Callable[..., Any]:
 def _summary(found: str | Commands) -> str:
     if not isinstance(found, str):
         return f"one of {', '.join(word for word in found if word)}"
-    function = _function(found)
-    if not inspect.isfunction(function):
-        return str(function.summary)  # type: ignore[attr-defined]
-    return (inspect.getdoc(function) or "").partition("\n")[0].rstrip(".")
+    return (inspect.getdoc(_function(found)) or "").partition("\n")[0].rstrip(".")
 
 
 def _split(value: str, hint: Any) -> Any:
