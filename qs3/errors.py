@@ -25,10 +25,6 @@ class MeshError(DataError):
     """A mesh is empty, not finite, truncated or unreadable."""
 
 
-class MeshMemoryError(MeshError):
-    """A mesh takes more memory than there is, or than may be taken."""
-
-
 class MeshUnavailableError(MeshError):
     """A file that was there cannot be read now: the disk is to blame, and not the mesh."""
 

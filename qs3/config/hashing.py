@@ -42,10 +42,6 @@ _UNHASHED = (
         )
     ),
 )
-# Left out where they are null, as they were before there were such keys: kept results stay valid.
-_NEW = ("weights",)
-_PRIOR = ("evaluation.prior", "evaluation.prior_power")  # of runs without a prior, likewise
-_FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone
 _FROM_OUTSIDE = re.compile(r"\$\{\s*oc\.")
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
@@ -66,31 +62,15 @@ def config_sha256(cfg: DictConfig) -> str:
         _leave_out(plain, key)
     plain.setdefault("callbacks", {})  # ~callbacks is callbacks=none
     plain = _with_values(plain, cfg, "", _FROM_OUTSIDE)
-    for key in _NEW:
-        if plain.get(key) is None:
-            _leave_out(plain, key)
-    if (plain.get("evaluation") or {}).get("prior") is None:
-        for key in _PRIOR:
-            _leave_out(plain, key)
-    if (plain.get("data") or {}).get("scale") != "above_floor":
-        for key in _FLOORS:
-            _leave_out(plain, key)
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None
         plain = _with_values(plain, cfg, "", _from(["selftraining"]))
     trainer = plain.get("trainer")
-    if isinstance(trainer, dict) and trainer.get("float32_matmul") == "highest":
-        trainer.pop("float32_matmul")  # as it was before there was such a key
     devices = trainer.get("devices") if isinstance(trainer, dict) else None
     if isinstance(devices, list) and len(devices) == 1:
         trainer["devices"] = 1
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def is_hashed(key: str) -> bool:
-    """Whether a config key may change a result, so that a run's hash knows its value."""
-    return not any(key == one or key.startswith(f"{one}.") for one in _UNHASHED)
 
 
 def with_values(cfg: DictConfig, keys: Sequence[str]) -> Any:

@@ -24,7 +24,7 @@ import yaml  # type: ignore[import-untyped,unused-ignore]
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.errors import ConfigError, Qs3Error
 from qs3.inference.model_card import card
 from qs3.inference.model_file import (
     CARD,

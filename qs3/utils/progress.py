@@ -45,36 +45,6 @@ def shown(items: Iterable[T], label: str, total: int | None = None) -> Iterator[
     yield from track(items, label, total, console=console, transient=True, disable=quiet)
 
 
-@contextmanager
-def byte_bar(label: str, total: int | None, done: int = 0) -> Iterator[Callable[[int], None]]:
-    """Show on a terminal how much of a file is there; gives a function to tell what has come.
-
-    All in bytes, of which `done` were there before; `total` is None if nobody knows it.
-    """
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-        TransferSpeedColumn,
-    )
-
-    console = Console(stderr=True)
-    with Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    ) as bar:
-        task = bar.add_task(label, total=total, completed=done)
-        yield lambda count: bar.advance(task, count)
-
-
 def terminal_bar(*fields: str, transient: bool = False) -> Progress:
     """A bar on stderr, to be started: description, bar, steps of all, `fields`, time gone and left.
 
