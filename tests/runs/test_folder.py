@@ -68,14 +68,6 @@ def test_hash_sees_what_changes_the_result_and_nothing_else(key):
     assert same == (key in IGNORED)
 
 
-def test_floors_matter_to_heights_alone():
-    for scale, matters in (("metres", False), ("above_floor", True)):
-        low, high = (
-            config(**{"data.scale": scale, "data.target.floor_m": z}) for z in (-1.25, -1.0)
-        )
-        assert (hashing.config_hash(low) != hashing.config_hash(high)) == matters
-
-
 @pytest.mark.parametrize("none", [{"rounds": 0}, {"_target_": "qs3.datamodules.phases.no_rounds"}])
 def test_hash_ignores_settings_of_rounds_that_there_are_not(none):
     changes = {f"selftraining.{key}": value for key, value in none.items()}
