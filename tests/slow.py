@@ -44,7 +44,6 @@ PATTERNS = (
     r"datasets/test_domain\.py::test_processes_that_open",
     r"datasets/importers/test_importers\.py::test_(kill_9|npy_header_damaged)",
     # What grew since: one of each family stays. Committed tables are composed by others, too.
-    r"test_docs\.py::test_the_example_of_gradients",
     # What had grown since, or takes longer than the parts that stay.
 )
 
