@@ -288,6 +288,8 @@ def _pointed(
 ) -> Iterator[Sample | Row]:
     name = printable_name(path.name)
     try:
+        if (mask is None) == (box is None):
+            raise DataError("a depth image takes a mask (of its name, in a folder) or a box")
         depth = read_depth(path, scale_m, given.depth_scale)
         camera = check_intrinsics(given, depth, str(path))
         numbers = None if mask is None else read_mask(mask)
