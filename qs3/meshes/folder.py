@@ -26,7 +26,7 @@ from typing import Annotated, Literal
 from annotated_types import Gt, Lt
 
 from qs3.classes import CLASSES, known_as
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, MissingDataError
 from qs3.meshes.io import SUFFIXES, Up, load_mesh
 from qs3.meshes.mesh import MeshItem
 from qs3.utils.settings import settings
@@ -105,7 +105,6 @@ class MeshFolder:
         for entry in _visible(self.path):
             cls = known_as(entry.name, self.known)
             if entry.is_dir() and cls in self._wanted:
-                self._check_link(entry)
                 folders.setdefault(cls, []).append(entry)
         missing = [name for name in self._wanted if name not in folders]
         if not folders or not set(missing) <= set(self.optional):
@@ -123,7 +122,6 @@ class MeshFolder:
             loose += self._mesh_files(folder, allowed=tuple(SPLIT_FOLDERS))
             for entry in _visible(folder):
                 if entry.is_dir() and entry.name.lower() in SPLIT_FOLDERS:
-                    self._check_link(entry)
                     given[SPLIT_FOLDERS[entry.name.lower()]] += self._mesh_files(entry)
         if loose and any(given.values()):
             raise ConfigError(
@@ -144,7 +142,6 @@ class MeshFolder:
                         f"{mesh} lies in a folder that is neither a class nor a split: {LAYOUTS}"
                     )
             elif entry.suffix.lower() in SUFFIXES:
-                self._check_link(entry)
                 files.append(entry)
         return files
 
@@ -176,13 +173,6 @@ class MeshFolder:
         load = partial(load_mesh, file, keep_colliders=self.keep_colliders, up=self.up)
         origin = file.relative_to(self.path).as_posix()
         return MeshItem(f"{cls}/{split}/{stem}", cls, split, load, origin, file)
-
-    def _check_link(self, entry: Path) -> None:
-        """Raise DataError for a link out of the root, which another machine would not follow."""
-        if entry.is_symlink() and not entry.resolve().is_relative_to(self.path.resolve()):
-            raise DataError(
-                f"{entry} is a link that leads out of {self.path}, to {entry.resolve()}"
-            )
 
 
 def _visible(folder: Path) -> list[Path]:

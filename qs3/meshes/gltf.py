@@ -1,8 +1,9 @@
 """glTF 2.0 and its binary form GLB: the triangles of the scene, turned to z up.
 
-Read here: trimesh 5.2 silently drops nodes that carry a camera, triangle fans, and scenes that are
-not listed; reads sparse, compressed and normalised vertices as other numbers; and knows neither
-skins nor morph targets nor instances nor what is hidden.
+trimesh reads the part of the file's JSON that is shown. Of a whole file trimesh 5.2 silently drops
+nodes that carry a camera, triangle fans, and scenes that are not listed; reads sparse, compressed
+and normalised vertices as other numbers; and ignores skins, morph targets, instances and what is
+hidden.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
@@ -10,22 +11,20 @@ https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 from __future__ import annotations
 
 import base64
+import io
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-import numpy as np
-
 from qs3.errors import MeshError
-from qs3.meshes.mesh import Y_UP_TO_Z_UP, Colliders, used_part
-from qs3.meshes.polygons import Triangles, joined
+from qs3.meshes.mesh import Y_UP_TO_Z_UP, Colliders, Mesh
+from qs3.meshes.polygons import Triangles
 
 _HEADER = struct.Struct("<4sIII4s")  # of GLB: magic, version, length; of the JSON length and kind
 _POINTS_AND_LINES, _TRIANGLES, _STRIP = range(4), 4, 5
-_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _VISIBILITY, _INSTANCES = "KHR_node_visibility", "EXT_mesh_gpu_instancing"
 _EXTENSIONS = (
     *("KHR_mesh_quantization", _VISIBILITY),  # understood; the others do not touch the surface
@@ -35,10 +34,22 @@ _EXTENSIONS = (
 
 def read_gltf(data: bytes, folder: Path, colliders: Colliders) -> Triangles:
     """Read either form; buffers lie within the file, or in files of the same folder."""
+    import trimesh
+
     tree, binary = _parsed(data)
-    buffers = [_buffer(one.get("uri"), binary, folder) for one in tree.get("buffers", [])]
-    vertices, faces = joined(_Scene(tree, buffers, colliders).parts())
-    return vertices @ Y_UP_TO_Z_UP.T, faces
+    _keep_shown(tree, colliders)
+    names = [str(index) for index in range(len(tree.get("buffers", [])))]
+    buffers = {
+        name: _buffer(buffer.get("uri"), binary, folder)
+        for name, buffer in zip(names, tree.get("buffers", []), strict=True)
+    }
+    text = json.dumps({**tree, "buffers": [{"uri": name} for name in names]}).encode()
+    file = io.BytesIO(text)
+    scene: Any = trimesh.load(
+        file, file_type="gltf", resolver=buffers, process=False, skip_materials=True
+    )
+    mesh = Mesh.from_trimesh(scene, keep_colliders=True)
+    return mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces
 
 
 def buffer_files(path: Path) -> list[Path]:
@@ -89,105 +100,75 @@ def _beside(uri: str, folder: Path) -> Path:
     return path
 
 
-class _Scene:
-    """The surfaces of a file's scene."""
-
-    def __init__(self, tree: dict[str, Any], buffers: list[bytes], colliders: Colliders) -> None:
-        self.tree, self.buffers, self.colliders = tree, buffers, colliders
-        self.hidden = 0
-
-    def parts(self) -> Iterator[Triangles]:
-        """All instances of meshes, put into the world, in the order of the file."""
-        for root in self._roots():
-            yield from self._below(root, np.eye(4))
-        if self.hidden:
-            self.colliders.notes.append(f"{self.hidden} hidden nodes are left out with all below")
-
-    def _roots(self) -> list[int]:
-        if scenes := self.tree.get("scenes"):
-            roots: list[int] = dict(enumerate(scenes))[self.tree.get("scene", 0)].get("nodes", [])
-            return roots
-        nodes = self.tree.get("nodes", [])
-        children = {child for node in nodes for child in node.get("children", [])}
-        return [index for index in range(len(nodes)) if index not in children]
-
-    def _below(self, index: int, above: np.ndarray) -> Iterator[Triangles]:
-        """The surfaces of a node and of those below it; of colliders and what is hidden, none."""
-        node = self.tree["nodes"][index]
-        if self.colliders.left_out(node.get("name")):
-            return
-        if node.get("extensions", {}).get(_VISIBILITY, {}).get("visible", True) is False:
-            self.hidden += 1
-            return
-        world = above @ _transform(node)
+def _keep_shown(tree: dict[str, Any], colliders: Colliders) -> None:
+    """Leave the nodes that are shown, and of them what is read; raise MeshError for what is not."""
+    nodes = tree.get("nodes", [])
+    waiting = _roots(tree)
+    tree["scenes"], tree["scene"] = [{"nodes": waiting}], 0
+    shown: dict[int, dict[str, Any]] = {}
+    hidden = 0
+    while waiting:
+        index, *waiting = waiting
+        node = nodes[index]
+        extensions = node.get("extensions", {})
+        if index in shown:
+            raise MeshError("has a node in two places, or within itself")
+        shown[index] = {}
+        if colliders.left_out(node.get("name")):
+            continue
+        if extensions.get(_VISIBILITY, {}).get("visible", True) is False:
+            hidden += 1
+            continue
+        waiting = [*waiting, *node.get("children", [])]
+        placed = ("children", "matrix", "rotation", "scale", "translation")
+        shown[index] = {key: node[key] for key in placed if key in node}
         if "mesh" in node:
-            mesh = self.tree["meshes"][node["mesh"]]
-            if not self.colliders.left_out(mesh.get("name")):
-                _check_rigid(node, mesh)
-                for part in mesh["primitives"]:
-                    if part.get("mode", _TRIANGLES) not in _POINTS_AND_LINES:
-                        own, faces = used_part(*self._primitive(part))
-                        yield own @ world[:3, :3].T + world[:3, 3], faces
-        for child in node.get("children", []):
-            yield from self._below(child, world)
-
-    def _primitive(self, part: dict[str, Any]) -> Triangles:
-        """Vertices and faces of a list or a strip of triangles."""
-        vertices = self._numbers(part["attributes"]["POSITION"], "VEC3", 3)
-        corners = np.arange(len(vertices))
-        if "indices" in part:
-            corners = self._numbers(part["indices"], "SCALAR", 1)[:, 0].astype(np.int64)
-        mode = part.get("mode", _TRIANGLES)
-        if mode == _TRIANGLES:
-            return vertices, corners.reshape(-1, 3)
-        if mode != _STRIP:
-            raise MeshError("has triangle fans, which are not read: export triangles")
-        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-        faces[1::2] = faces[1::2, ::-1]  # all of one orientation
-        return vertices, faces
-
-    def _numbers(self, index: int, kind: str, columns: int) -> np.ndarray:
-        """[n, columns] float64 of an accessor."""
-        accessor = self.tree["accessors"][index]
-        if "bufferView" not in accessor or "sparse" in accessor or accessor["type"] != kind:
-            raise MeshError("has sparse or compressed vertices, which are not read")
-        view = self.tree["bufferViews"][accessor["bufferView"]]
-        dtype = np.dtype(_TYPES[accessor["componentType"]])
-        start, buffer = view.get("byteOffset", 0), self.buffers[view["buffer"]]
-        data = buffer[start : start + view["byteLength"]]
-        strides = (view.get("byteStride", columns * dtype.itemsize), dtype.itemsize)
-        shape, offset = (accessor["count"], columns), accessor.get("byteOffset", 0)
-        values = np.ndarray(shape, dtype, data, offset, strides).astype(np.float64)
-        if accessor.get("normalized"):
-            values = np.maximum(values / np.iinfo(dtype).max, -1.0)
-        return values
+            mesh = tree["meshes"][node["mesh"]]
+            if not colliders.left_out(mesh.get("name")):
+                _check(tree, node, mesh)
+                shown[index]["mesh"] = node["mesh"]
+    tree["nodes"] = [shown.get(index, {}) for index in range(len(nodes))]
+    for mesh in tree.get("meshes", []):
+        mesh["primitives"] = [
+            part for part in mesh["primitives"] if part.get("mode", _TRIANGLES) >= _TRIANGLES
+        ]
+    if hidden:
+        colliders.notes.append(f"{hidden} hidden nodes are left out with all below")
 
 
-def _check_rigid(node: dict[str, Any], mesh: dict[str, Any]) -> None:
-    """Raise MeshError where the vertices that are stored are not those that are shown."""
+def _roots(tree: dict[str, Any]) -> list[int]:
+    if scenes := tree.get("scenes"):
+        roots: list[int] = dict(enumerate(scenes))[tree.get("scene", 0)].get("nodes", [])
+        return roots
+    nodes = tree.get("nodes", [])
+    children = {child for node in nodes for child in node.get("children", [])}
+    return [index for index in range(len(nodes)) if index not in children]
+
+
+def _check(tree: dict[str, Any], node: dict[str, Any], mesh: dict[str, Any]) -> None:
+    """Raise MeshError where the vertices that trimesh would read are not those that are shown."""
     weights = node.get("weights", mesh.get("weights", ()))
-    morphed = any(
-        weight != 0 and "POSITION" in target
-        for part in mesh["primitives"]
-        for weight, target in zip(weights, part.get("targets", ()), strict=False)
-    )
-    if morphed or "skin" in node or _INSTANCES in node.get("extensions", {}):
-        raise MeshError(
-            "has a skin, a morph target or instances, which are not read: export it as it is shown"
-        )
+    for part in mesh["primitives"]:
+        mode = part.get("mode", _TRIANGLES)
+        if mode > _STRIP:
+            raise MeshError("has triangle fans, which are not read: export triangles")
+        targets = zip(weights, part.get("targets", ()), strict=False)
+        if any(weight != 0 and "POSITION" in target for weight, target in targets):
+            raise MeshError("has a morph target, which is not read: export it as it is shown")
+        accessors = [(part["attributes"]["POSITION"], "VEC3"), (part.get("indices"), "SCALAR")]
+        if mode >= _TRIANGLES:
+            for index, kind in accessors[: 1 + ("indices" in part)]:
+                _check_accessor(tree, tree["accessors"][index], kind)
+    if "skin" in node or _INSTANCES in node.get("extensions", {}):
+        raise MeshError("has a skin or instances, which are not read: export it as it is shown")
 
 
-def _transform(node: dict[str, Any]) -> np.ndarray:
-    """[4, 4] of a node in the one above it."""
-    if "matrix" in node:
-        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T  # column-major
-    matrix = np.eye(4)
-    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))  # a unit quaternion
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
-    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-    return matrix
+def _check_accessor(tree: dict[str, Any], accessor: dict[str, Any], kind: str) -> None:
+    if "sparse" in accessor or accessor.get("normalized") or accessor["type"] != kind:
+        raise MeshError("has sparse, compressed or normalised vertices, which are not read")
+    view = tree["bufferViews"][accessor["bufferView"]]
+    item = _BYTES[accessor["componentType"]] * {"VEC3": 3, "SCALAR": 1}[kind]
+    start, stride = accessor.get("byteOffset", 0), view.get("byteStride", item)
+    end = start + (accessor["count"] - 1) * stride + item
+    if min(start, accessor["count"] - 1) < 0 or end > view["byteLength"]:
+        raise MeshError("is truncated: its vertices reach beyond their buffer")

@@ -6,12 +6,14 @@ trimesh 5.2 gives other triangles of them, silently:
   beside any other (http://www.geomview.org/docs/html/OFF.html).
 - OBJ: it takes indices relative to the end of the list so far ("f -3 -2 -1") as relative to the end
   of the file. The format has no counts, so a file that was cut between two faces is not noticed.
-- STL: it leaves out what is damaged in a text, as a solid without its end.
+- STL, which it reads: it leaves out what is damaged in a text, as a solid without its end.
 """
 
 from __future__ import annotations
 
+import io
 import re
+from collections import Counter
 
 import numpy as np
 
@@ -20,11 +22,7 @@ from qs3.meshes.polygons import Triangles, lines, numbers, triangulated, whole
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)(4?n?)OFF[ \t]*(BINARY)?")
 _COUNTS = re.compile(rb"\s*(\d{1,12})[ \t]+(\d{1,12})(?:[ \t]+-?\d{1,12})?(?=\s|$)")
-_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_STL_HEADER = 84  # bytes
-_VERTEX = re.compile(rb"(?im)^[ \t]*vertex[ \t]+(\S+[ \t]+\S+[ \t]+\S+)[ \t]*$")
-_STL_WORDS = re.compile(rb"(?im)^[ \t]*(endfacet|vertex|endloop)\b")
-_SOLIDS = re.compile(rb"(?im)^[ \t]*(endsolid|solid)\b")
+_STL_WORDS = re.compile(rb"(?m)^[ \t]*(endfacet|vertex|endloop)\b")
 
 
 def read_off(data: bytes) -> Triangles:
@@ -114,27 +112,13 @@ def read_stl(data: bytes) -> Triangles:
 
     The first word does not decide: many binary files begin with "solid", too.
     """
-    facets = int.from_bytes(data[80:_STL_HEADER], "little")
-    if len(data) >= _STL_HEADER and len(data) == _STL_HEADER + _FACET.itemsize * facets:
-        vertices = np.frombuffer(data, _FACET, offset=_STL_HEADER)["corners"].astype(np.float64)
-    else:
-        vertices = numbers(b" ".join(_text_vertices(data)))
-    vertices = vertices.reshape(-1, 3)
-    return vertices, np.arange(len(vertices), dtype=np.int64).reshape(-1, 3)
+    import trimesh
 
-
-def _text_vertices(data: bytes) -> list[bytes]:
-    """The three numbers of each vertex; MeshError where one, or the end of a solid, is missing."""
-    data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    words = [word.lower() for word in _STL_WORDS.findall(data)]
-    facets = len(words) // 5
-    solids = [word.lower() for word in _SOLIDS.findall(data)]
-    found = _VERTEX.findall(data)
-    if (
-        words != [*[b"vertex"] * 3, b"endloop", b"endfacet"] * facets
-        or len(found) != 3 * facets
-        or solids != [b"solid", b"endsolid"] * (len(solids) // 2)
-        or not data.rstrip().rpartition(b"\n")[2].lstrip().lower().startswith(b"endsolid")
-    ):
-        raise MeshError("is truncated or not an STL file")
-    return found
+    loaded = trimesh.load_mesh(io.BytesIO(data), file_type="stl", process=False)
+    if len(data) != 84 + 50 * int.from_bytes(data[80:84], "little"):
+        words = Counter(_STL_WORDS.findall(data.lower()))
+        expected = {b"vertex": 3, b"endloop": 1, b"endfacet": 1}
+        ends = re.fullmatch(rb"endsolid\b.*", data.lower().strip().splitlines()[-1].strip())
+        if not ends or any(words[word] != n * len(loaded.faces) for word, n in expected.items()):
+            raise MeshError("is truncated or not an STL file")
+    return np.array(loaded.vertices), np.array(loaded.faces)

@@ -162,14 +162,13 @@ def read_3mf(data: bytes, colliders: Colliders) -> Triangles:
 
 
 def _plate(root: Element, colliders: Colliders) -> Iterator[Triangles]:
-    """All instances of meshes, put into the world, in the order in which trimesh visits them."""
+    """All instances of meshes, put into the world, in the order of the file."""
     objects = {element.get("id", ""): element for element in root.iter("object")}
     meshes = {name: _triangles(element) for name, element in objects.items()}
     helpers = 0
 
-    def below(links: list[Element], path: list[np.ndarray]) -> Iterator[Triangles]:
+    def below(links: list[Element], above: np.ndarray) -> Iterator[Triangles]:
         nonlocal helpers
-        kept: list[Element] = []
         for link in links:
             if any(key.endswith("}path") for key in link.attrib):
                 raise MeshError("is spread over several files, which is not read: export one model")
@@ -177,18 +176,12 @@ def _plate(root: Element, colliders: Colliders) -> Iterator[Triangles]:
             if element.get("type", "model") in _NO_PART:
                 helpers += 1
             elif not colliders.left_out(element.get("name"), link.get("partnumber")):
-                kept.append(link)
-        # The first, and then from the last to the second, those of one object together.
-        names = [link.get("objectid", "") for link in kept]
-        kept.sort(key=lambda link: names.index(link.get("objectid", "")))
-        for link in kept[:1] + kept[:0:-1]:
-            name, there = link.get("objectid", ""), [*path, _matrix(link.get("transform"))]
-            if mesh := meshes[name]:
-                matrix = np.linalg.multi_dot(there) if len(there) > 1 else there[0]
-                yield mesh[0] @ matrix[:3, :3].T + matrix[:3, 3], mesh[1]
-            yield from below(objects[name].findall("components/component"), there)
+                matrix = above @ _matrix(link.get("transform"))
+                if mesh := meshes[element.get("id", "")]:
+                    yield mesh[0] @ matrix[:3, :3].T + matrix[:3, 3], mesh[1]
+                yield from below(element.findall("components/component"), matrix)
 
-    yield from below(root.findall("build/item"), [])
+    yield from below(root.findall("build/item"), np.eye(4))
     if helpers:
         colliders.notes.append(f"{helpers} objects for printing ({', '.join(_NO_PART)}) left out")
 
