@@ -24,7 +24,6 @@ PATTERNS = (
     r"datasets/test_domain\.py::test_every_domain_opens.*\[(?!depthscannet10|modelnet10\]|specklenet10\]|scannet10\]|own|nyuv2)",
     r"utils/test_cli\.py::test_a_reader_that_has_seen_enough.*\[words[123]",
     r"datasets/frames/test_real_kinect\.py::test_two_ways",
-    r"datasets/scannet/test_extraction\.py::test_other_files",
     # Further members of families that the quick run knows by one or two.
     r"datasets/test_domain\.py::test_every_domain_opens.*\[nyuv2",
     r"datasets/frames/test_(our_sensors\.py::test_(clouds_lie|what_was_placed)|real_kinect\.py::test_what_lies)",
@@ -38,8 +37,6 @@ PATTERNS = (
     r"datasets/frames/test_sunrgbd\.py::test_the_raw_depth",
     r"datasets/frames/test_nyuv2\.py::test_an_interrupted_import",
     r"datasets/test_ensure_source\.py::test_a_missing_source_is_made",
-    r"datasets/scannet/test_extraction\.py::test_(force_starts|the_number_of_workers|an_object_that_is_nowhere)",
-    r"datasets/scannet/test_masks\.py::test_a_zip_cannot",
     r"config/test_quoting\.py::test_every_path_of_ours",
     r"datasets/test_domain\.py::test_processes_that_open",
     r"datasets/importers/test_importers\.py::test_(kill_9|npy_header_damaged)",

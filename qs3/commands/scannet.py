@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from annotated_types import Ge, Gt
+from annotated_types import Ge
 
 
 def scannet(
@@ -25,43 +25,34 @@ def scannet(
         Path, "folder of the dataset; domain=depthscannet10 expects data/depthscannet10"
     ],
     workers: Annotated[int, Ge(0), "processes; their number changes no byte"] = 1,
-    engine: Annotated[Literal["local", "ray", "slurm"], "on which machines"] = "local",
-    force: Annotated[bool, "delete the dataset at out first"] = False,
-    points: Annotated[int, Ge(1), "of a cloud (farthest point sampling)"] = 2048,
-    min_points: Annotated[
-        int, Ge(0), "a frame counts if it shows more points of the object"
-    ] = 1000,
-    views: Annotated[int, Ge(1), "frames fused, far from each other in direction"] = 10,
-    stride: Annotated[
-        int, Ge(1), "look at every n-th frame only; 10 takes a tenth of the time"
-    ] = 1,
-    depth_min_m: Annotated[float, Gt(0), "nearer depths are left out"] = 0.1,
-    depth_max_m: Annotated[float, Gt(0), "farther depths are left out"] = 10.0,
-    margin_px: Annotated[int, Ge(0), "pixels around that must show the same object, too"] = 1,
-    column: Annotated[Literal["category", "raw_category"], "of the label map"] = "category",
-    **more: Annotated[str, "settings of conf/engine/ray.yaml or slurm.yaml: engine.address=auto"],
+    **more: Annotated[
+        str,
+        "fields of qs3.datasets.scannet.ScanNet: min_points=1000 views=10 stride=1 on_error=skip",
+    ],
 ) -> None:
     r"""DepthScanNet10 from raw ScanNet: objects cropped from the depth images.
 
     Accept ScanNet's terms of use first, http://www.scan-net.org. Defaults are those of the paper
-    where it names one. Run the same command again after an interruption: it continues. Scenes that
-    failed (scenes.csv says why) or came later are then extracted and added.
+    where it names one. Run the same command again after an interruption, or when a damaged scene
+    is mended: it continues. on_error=skip leaves damaged scenes out, and manifest.csv says why.
 
     Example:
         qs3 scannet scans=SCANNET/scans labels=SCANNET/scannetv2-labels.combined.tsv \
             train=SCANNET/scannetv2_train.txt val=SCANNET/scannetv2_val.txt \
             out=data/depthscannet10
-    """  # fmt: skip
-    from qs3.cluster import pool_of
-    from qs3.datasets.scannet import extract
-    from qs3.datasets.scannet_scene import Extraction
+    """
+    from qs3.classes import CLASSES
+    from qs3.config.hydra import build
+    from qs3.datasets.importing import import_into
 
-    settings = Extraction(
-        points, min_points, views, stride, depth_min_m, depth_max_m, margin_px, column
+    lists = {"labels": labels, "train": train, "val": val}
+    importer = build(
+        {
+            "_target_": "qs3.datasets.scannet.ScanNet",
+            "folder": str(scans),
+            "workers": workers,
+            **{key: str(path.absolute()) for key, path in lists.items()},
+            **more,
+        }
     )
-    words = [f"{key}={value}" for key, value in more.items()]
-    pool = pool_of(engine, workers, words, out.absolute().parent)
-    extract(
-        scans=scans, labels=labels, train=train, val=val, out=out, settings=settings, force=force,
-        pool=pool,
-    )  # fmt: skip
+    import_into(out, importer, name=out.name, classes=CLASSES)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import abc
 import functools
-import logging
-import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,30 +13,63 @@ from jaxtyping import Float, Int
 
 from qs3.datasets.clouds import read_arrays
 from qs3.datasets.importing import Importer, Item, by_class, class_of, cloud_id, split_of, turned
-from qs3.errors import DataError
 from qs3.store.manifest import ManifestRow
 from qs3.store.meta import MadeOf
 from qs3.utils.files import reading
 from qs3.utils.settings import settings
 
-log = logging.getLogger(__name__)
+Cloud = tuple[str, str, str, np.ndarray]
+"""Class, split, name and points [P, 3] of one cloud."""
 
-_KEYS = ("points", "cls", "split", "name")
-_NAME = re.compile(r"(train|test)_(\d+)\.h5")
 _MIRROR = np.array([1, -1, 1], dtype=np.float32)
 
 SCANOBJECTNN: tuple[str, ...] = (
-    *("bag", "bin", "box", "cabinet", "chair", "desk", "display", "door", "shelf", "table"),
+    *("bag", "bin", "box", "cabinet", "chair", "desk", "monitor", "door", "bookshelf", "table"),
     *("bed", "pillow", "sink", "sofa", "toilet"),
 )
-"""ScanObjectNN's classes in the order of its labels."""
+"""ScanObjectNN's classes in the order of its labels, "display" and "shelf" by our names.
 
-OURS = {"display": "monitor", "shelf": "bookshelf"}
-"""Its names of our classes where they differ. A desk is not a table: ModelNet40 has both."""
+A desk is not a table: ModelNet40 has both."""
 
 
 @settings
-class NamedArrays(Importer):
+class ArrayFiles(Importer):
+    """Clouds in a few files, several in each; those of classes that are not wanted are left out."""
+
+    ordered: ClassVar[bool] = False
+    """Whether the clouds keep the order of the files; else split, class and name order them."""
+
+    @abc.abstractmethod
+    def files(self) -> list[tuple[str, Path]]:
+        """The split ("" of a file that has several) and the path of each, in order."""
+
+    @abc.abstractmethod
+    def clouds(self, path: Path, split: str, classes: Sequence[str]) -> Iterator[Cloud]:
+        """The clouds of a file, in its order."""
+
+    def looks_for(self) -> str:
+        """See `Importer`."""
+        return f"{self.root}/*: " + " ".join(path.name for _, path in self.files())
+
+    def is_there(self) -> bool:
+        """See `Importer`."""
+        return all(path.is_file() for _, path in self.files())
+
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """See `Importer`; reads the files."""
+        found = []
+        for of_file, path in self.files():
+            for i, (cls, split, name, cloud) in enumerate(self.clouds(path, of_file, classes)):
+                if cls in classes:
+                    id_, origin = cloud_id(cls, split, name), f"{path.name}[{i}]"
+                    row = ManifestRow(id_, cls, split, origin=origin)
+                    load = functools.partial(np.asarray, cloud)
+                    found.append(Item(row, f"{path}, cloud {i} ({name})", load))
+        return found if self.ordered else by_class(found, classes)
+
+
+@settings
+class NamedArrays(ArrayFiles):
     """One .npz with arrays `points` [N, P, 3], `cls` [N], `split` [N] and `name` [N].
 
     Attributes:
@@ -46,47 +78,22 @@ class NamedArrays(Importer):
 
     file: str = "points.npz"
 
-    @property
-    def path(self) -> Path:
-        """Where the .npz lies."""
-        return self.root / self.file
-
     def made_of(self) -> MadeOf:
         """See `Importer`."""
-        return MadeOf(objects=f"arrays of {self.path.name}")
+        return MadeOf(objects=f"arrays of {self.file}")
 
-    def looks_for(self) -> str:
-        """See `Importer`."""
-        return f"{self.path}   (arrays {', '.join(_KEYS)})"
+    def files(self) -> list[tuple[str, Path]]:
+        """See `ArrayFiles`."""
+        return [("", self.root / self.file)]
 
-    def is_there(self) -> bool:
-        """See `Importer`."""
-        return self.path.is_file()
-
-    def items(self, classes: Sequence[str]) -> list[Item]:
-        """See `Importer`; reads the file. Sorted by split, class and name."""
-        arrays = named_arrays(self.path)
-        found = []
-        for i, name in enumerate(arrays["name"].tolist()):
-            where = f"{self.path}, cloud {i} ({name})"
-            cls = class_of(str(arrays["cls"][i]), classes, where)
-            split = split_of(str(arrays["split"][i]), where)
-            row = ManifestRow(cloud_id(cls, split, name), cls, split, origin=f"{self.file}[{i}]")
-            found.append(Item(row, where, functools.partial(arrays["points"].__getitem__, i)))
-        return by_class(found, classes)
-
-
-def named_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The four arrays; DataError if damaged, missing, or of different lengths."""
-    arrays = read_arrays(path, _KEYS)
-    lengths = {key: len(array) for key, array in arrays.items()}
-    if len({*lengths.values()}) > 1 or arrays["points"].shape[2:] != (3,):
-        raise DataError(f"{path}: points {arrays['points'].shape} with {lengths}")
-    return arrays
+    def clouds(self, path: Path, split: str, classes: Sequence[str]) -> Iterator[Cloud]:
+        """See `ArrayFiles`."""
+        for cloud, cls, split, name in zip(*named_arrays(path).values(), strict=True):
+            yield class_of(str(cls), classes, path), split_of(str(split), path), str(name), cloud
 
 
 @settings
-class PointDAH5(Importer):
+class PointDAH5(ArrayFiles):
     """PointDA-10's ScanNet10: `train_0.h5 train_1.h5 train_2.h5 test_0.h5`.
 
     Each holds `data` [n, 2048, 6] (x y z in metres with y up, floor at 0; then rgb) and `label`
@@ -97,6 +104,7 @@ class PointDAH5(Importer):
     """
 
     undo_mirror: bool = True
+    ordered: ClassVar[bool] = True
 
     def made_of(self) -> MadeOf:
         """See `Importer`."""
@@ -104,33 +112,23 @@ class PointDAH5(Importer):
             return MadeOf(objects="published files, no longer mirrored")
         return MadeOf(objects="published files", published=True)
 
-    def looks_for(self) -> str:
-        """See `Importer`."""
-        return f"{self.root}/{{train,test}}_*.h5"
+    def files(self) -> list[tuple[str, Path]]:
+        """See `ArrayFiles`: all that there are, at least one a split."""
+        names = {s: sorted(self.root.glob(f"{s}_*.h5")) for s in ("train", "test")}
+        return [(s, p) for s in names for p in names[s] or [self.root / f"{s}_0.h5"]]
 
-    def is_there(self) -> bool:
-        """See `Importer`: whether there is a file for each split."""
-        return {split for split, _, _ in self._files()} == {"train", "test"}
-
-    def items(self, classes: Sequence[str]) -> list[Item]:
-        """See `Importer`; reads the files, about 50 MB each."""
-        files = self._files()
-        return [i for split, _, path in files for i in h5_items(path, split, classes, digits=4)]
+    def clouds(self, path: Path, split: str, classes: Sequence[str]) -> Iterator[Cloud]:
+        """See `ArrayFiles`."""
+        return _of_h5(path, split, classes, digits=4)
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
         cloud = turned(cloud, "y")
         return cloud * _MIRROR if self.undo_mirror else cloud
 
-    def _files(self) -> list[tuple[str, int, Path]]:
-        """(split, number, path), train before test, by number."""
-        paths = self.root.iterdir() if self.root.is_dir() else ()
-        found = [(m[1], int(m[2]), p) for p in paths if (m := _NAME.fullmatch(p.name))]
-        return sorted(found, key=lambda f: (f[0] == "test", f[1]))
-
 
 @settings
-class ScanObjectNN(Importer):
+class ScanObjectNN(ArrayFiles):
     """ScanObjectNN (Uy et al., ICCV 2019): objects segmented from real scans, 15 classes.
 
         main_split/{training,test}_objectdataset.h5                          objects as segmented
@@ -148,38 +146,23 @@ class ScanObjectNN(Importer):
     complete: ClassVar[bool] = False
     up: ClassVar[str] = "y"
 
-    def looks_for(self) -> str:
-        """See `Importer`."""
-        return f"{self.root}/{{training,test}}_objectdataset{self.variant}.h5"
-
-    def is_there(self) -> bool:
-        """See `Importer`: whether both files are there."""
-        return all(path.is_file() for _, path in self._files())
-
-    def items(self, classes: Sequence[str]) -> list[Item]:
-        """See `Importer`; reads the files."""
-        names = [OURS.get(name, name) for name in SCANOBJECTNN]
-        items = [i for split, path in self._files() for i in h5_items(path, split, names, digits=5)]
-        ours = [item for item in items if item.row.cls in classes]
-        log.info("%s: clouds of other classes left out: %d", self.root, len(items) - len(ours))
-        return by_class(ours, classes)
-
-    def _files(self) -> list[tuple[str, Path]]:
+    def files(self) -> list[tuple[str, Path]]:
+        """See `ArrayFiles`."""
         name = f"objectdataset{self.variant}.h5"
         return [("train", self.root / f"training_{name}"), ("test", self.root / f"test_{name}")]
 
+    def clouds(self, path: Path, split: str, classes: Sequence[str]) -> Iterator[Cloud]:
+        """See `ArrayFiles`."""
+        return _of_h5(path, split, SCANOBJECTNN, digits=5)
 
-def h5_items(path: Path, split: str, names: Sequence[str], digits: int) -> list[Item]:
-    """The clouds of one file, in its order; `names` of the classes by label."""
-    data, labels = read_h5(path)
-    if len(labels) != len(data) or (labels < 0).any() or (labels >= len(names)).any():
-        raise DataError(f"{path}: {len(data)} clouds, and labels that are not 0..{len(names) - 1}")
-    items = []
-    for number, (cloud, label) in enumerate(zip(data, labels, strict=True)):
-        id_ = cloud_id(names[label], split, f"{path.stem}_{number:0{digits}d}")
-        row = ManifestRow(id_, names[label], split, origin=f"{path.name}[{number}]")
-        items.append(Item(row, f"{path}, cloud {number}", functools.partial(np.asarray, cloud)))
-    return items
+
+def named_arrays(path: Path) -> dict[str, np.ndarray]:
+    """points, cls, split and name; DataError if damaged, missing, or of different lengths."""
+    arrays = read_arrays(path, ("points", "cls", "split", "name"))
+    with reading(path):
+        assert len({*map(len, arrays.values())}) == 1, "its arrays have different lengths"
+        assert arrays["points"].shape[2:] == (3,), f"points of shape {arrays['points'].shape}"
+    return arrays
 
 
 def read_h5(path: Path) -> tuple[Float[np.ndarray, "n P 3"], Int[np.ndarray, " n"]]:
@@ -189,3 +172,13 @@ def read_h5(path: Path) -> tuple[Float[np.ndarray, "n P 3"], Int[np.ndarray, " n
     with reading(path), h5py.File(path, "r") as file:
         points = np.asarray(file["data"][..., :3], dtype=np.float32)
         return points, np.asarray(file["label"][...], dtype=np.int64).reshape(-1)
+
+
+def _of_h5(path: Path, split: str, names: Sequence[str], digits: int) -> Iterator[Cloud]:
+    """The clouds of one file; `names` of the classes by label."""
+    data, labels = read_h5(path)
+    with reading(path):
+        assert len(labels) == len(data), f"{len(data)} clouds and {len(labels)} labels"
+        assert ((labels >= 0) & (labels < len(names))).all(), f"labels not 0..{len(names) - 1}"
+    for number, (cloud, label) in enumerate(zip(data, labels.tolist(), strict=True)):
+        yield names[label], split, f"{path.stem}_{number:0{digits}d}", cloud

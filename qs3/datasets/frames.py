@@ -2,8 +2,8 @@
 
 That takes minutes, so each finished frame is kept in a file of its own next to the store to come,
 and an interrupted import goes on where it stopped; other settings begin anew. The readers are
-`qs3.datasets.nyuv2` and `qs3.datasets.sunrgbd`; raw ScanNet, whose objects are fused from many
-frames of a scene, shares `finish_parts` (`qs3.datasets.scannet`).
+`qs3.datasets.nyuv2`, `qs3.datasets.sunrgbd` and `qs3.datasets.scannet`, whose objects are fused
+from many frames of a scene.
 """
 
 from __future__ import annotations
@@ -13,24 +13,25 @@ import functools
 import hashlib
 import logging
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import cv2
 import numpy as np
 from annotated_types import Ge
+from jaxtyping import Float
 
-from qs3.datasets.cutting import CLEAN, HARD, Piece
+from qs3.datasets.cutting import Piece
 from qs3.datasets.importing import Importer, Item, check_cloud, report, thinned
 from qs3.datasets.regions import Rules
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.store.manifest import OK, SPLITS, ManifestRow
 from qs3.store.parts import PartFiles
 from qs3.utils.files import reading
-from qs3.utils.pool import Pool, Processes
+from qs3.utils.pool import Processes
 from qs3.utils.progress import progress_bar
 from qs3.utils.settings import settings
 from qs3.utils.version import VERSION
@@ -71,42 +72,46 @@ class FrameTask:
         """Of its part."""
         return f"{self.number:06d}"
 
+    @property
+    def stem(self) -> str:
+        """Of its objects' ids."""
+        return f"{self.cluster}_{self.number:05d}"
+
 
 @dataclass(frozen=True, eq=False)
 class Cut:
     """One object of a frame, cut or refused.
 
     Attributes:
-        cls, sub: its class, and its name in the dataset.
+        cls: its class.
         origin: for a human.
-        piece: what was cut.
+        points_m: [n, 3] float32, z up.
+        pixels: with depth.
+        reason: why it cannot be used; "" otherwise.
+        more: further columns of the manifest.
+        views: frames that it was cut from.
     """
 
     cls: str
-    sub: str
     origin: str
-    piece: Piece
+    points_m: Float[np.ndarray, "n 3"]
+    pixels: int
+    reason: str
+    more: dict[str, str]
+    views: int = 1
 
 
 Cutter = Callable[[FrameTask], list[Cut]]
 
 
 @settings
-class FrameDataset(Importer):
-    """A dataset of depth images; see the module.
+class CutDataset(Importer):
+    """A dataset whose objects are cut frame by frame, or scene by scene; see the module.
 
     Attributes:
-        names: name in the dataset -> class; names that are not in it are left alone.
-        rules: as `qs3.datasets.regions.Rules`.
-        tiers: which of "clean" and "hard" become clouds.
-        block: so many frames in a row make a cluster, where rooms are not known.
         workers: processes; 0 works in this one. Their number changes no byte.
     """
 
-    names: dict[str, str] = field(default_factory=dict)
-    rules: Rules = field(default_factory=Rules)
-    tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: [CLEAN, HARD])  # type: ignore[list-item]
-    block: Annotated[int, Ge(1)] = 30
     workers: Annotated[int, Ge(0)] = 0
 
     complete: ClassVar[bool] = False
@@ -154,30 +159,37 @@ class FrameDataset(Importer):
         self, classes: Sequence[str], work: Path
     ) -> tuple[list[np.ndarray], list[ManifestRow]]:
         """See `Importer`: cuts what is not cut yet, then puts all together."""
-        limited = {*self.rules.limits} - {"default"}
-        if unknown := sorted({*self.names.values(), *limited} - {*classes}):
-            raise ConfigError(f"published.names or rules.limits: unknown classes {unknown}")
-        parts = self._begun(work)
-        tasks = self.tasks()
+        parts, tasks, failed = self._begun(work), self.tasks(), {}
         todo = [(task.name, task) for task in tasks if not parts.has(task.name)]
-        pool, make = Processes(self.workers), functools.partial(_worker, self)
-        failed = finish_parts(
-            parts, todo, make, pool, f"cutting objects from {self.root.name}",
-            stop=self.on_error == "stop",
-        )  # fmt: skip
-        found = [one for task in tasks for one in self._of_frame(parts, task, failed)]
+        make = functools.partial(_worker, self)
+        with progress_bar(f"cutting objects from {self.root.name}", total=len(todo)) as advance:
+            for outcome in Processes(self.workers).run(make, todo) if todo else ():
+                result = outcome.result or f"{outcome.name}: {_DIED}"
+                if not isinstance(result, str):
+                    parts.write(outcome.name, *result)
+                elif self.on_error == "stop":
+                    raise DataError(result)
+                else:
+                    failed[outcome.name] = result
+                advance()
+        found = [one for task in tasks for one in self._of_task(parts, task, failed)]
         label = {name: i for i, name in enumerate(classes)}
         found.sort(key=lambda f: (SPLITS.index(f[0].split), label.get(f[0].cls, -1), f[0].id))
         rows = [row for row, _ in found]
-        clouds = [cloud for row, cloud in found if row.status == OK and cloud is not None]
-        tiers = Counter(row.more["tier"] for row in rows if row.status == OK)
-        log.info("%s: objects cut: %s", self.root, dict(sorted(tiers.items())))
+        clouds = [cloud for _, cloud in found if cloud is not None]
         report(rows, self.points, self.root)
+        if not clouds:
+            raise DataError(f"{self.root}: no object could be cut")
         return clouds, rows
 
     def _begun(self, work: Path) -> PartFiles:
         """The folder of parts: those of the same settings and versions, or none."""
-        versions = {"qs3": VERSION, "numpy": np.__version__, "scipy": version("scipy")}
+        versions = {
+            "qs3": VERSION,
+            "numpy": np.__version__,
+            "opencv": cv2.__version__,
+            **{name: version(name) for name in ("scipy", "fpsample")},
+        }
         recipe, parts = {"settings": self.settings(), "versions": versions}, PartFiles(work)
         if parts.have_recipe:
             try:
@@ -188,72 +200,87 @@ class FrameDataset(Importer):
         parts.begin(recipe)
         return parts
 
-    def _of_frame(
+    def _of_task(
         self, parts: PartFiles, task: FrameTask, failed: Mapping[str, str]
     ) -> Iterator[tuple[ManifestRow, np.ndarray | None]]:
         """Rows of one frame's objects with their clouds."""
-        stem = f"{task.cluster}_{task.number:05d}"
         more = {"frame": str(task.number), "sensor": task.sensor, "vertical": task.vertical}
         if why := failed.get(task.name, ""):
-            id_ = f"{task.split}/{stem}"
+            id_ = f"{task.split}/{task.stem}"
             yield ManifestRow(id_, "", task.split, status="skipped", reason=why, more=more), None
             return
         note, arrays = parts.read(task.name)
         for i, one in enumerate(note["objects"]):
-            reason = one["reason"]
-            if not reason and one["more"]["tier"] not in self.tiers:
-                reason = f"{one['more']['tier']} ({one['more']['why']})"
             row = ManifestRow(
-                f"{one['cls']}/{task.split}/{stem}_{i}",
+                f"{one['cls']}/{task.split}/{task.stem}_{i}",
                 one["cls"],
                 task.split,
                 origin=one["origin"],
-                views=1,
+                views=one["views"],
                 valid_points=one["pixels"],
-                status="skipped" if reason else OK,
-                reason=reason,
+                status="skipped" if one["reason"] else OK,
+                reason=one["reason"],
                 more={key: value for key in COLUMNS if (value := (more | one["more"]).get(key))},
             )
-            yield row, None if reason else check_cloud(arrays[str(i)], self.points, row.id)
+            cloud = None if row.reason else check_cloud(arrays[str(i)], self.points, row.id)
+            yield row, cloud
 
 
-def finish_parts(
-    parts: PartFiles,
-    todo: Sequence[tuple[str, Any]],
-    make: Callable[[], Callable[[Any], Part | str]],
-    pool: Pool,
-    label: str,
-    stop: bool,
-) -> dict[str, str]:
-    """Do tasks in a pool of processes, and keep what each gave as a part.
+@settings
+class FrameDataset(CutDataset):
+    """A dataset of depth images.
 
-    Args:
-        parts: where they are kept.
-        todo: names of parts, and their tasks.
-        make: called once in each process; gives what does a task, or says in words why it cannot
-            be done.
-        pool: of processes.
-        label: of the progress bar.
-        stop: raise at the first that cannot be done.
-
-    Returns:
-        Why some could not be done, by name.
-
-    Raises:
-        DataError: one could not, with `stop`.
+    Attributes:
+        names: name in the dataset -> class; names that are not in it are left alone.
+        rules: as `qs3.datasets.regions.Rules`.
+        tiers: which of "clean" and "hard" become clouds.
+        block: so many frames in a row make a cluster, where rooms are not known.
     """
-    failed = {}
-    with progress_bar(label, total=len(todo)) as advance:
-        for outcome in pool.run(make, todo) if todo else ():
-            result = outcome.result or f"{outcome.name}: {_DIED}"
-            if not isinstance(result, str):
-                parts.write(outcome.name, *result)
-            elif stop:
-                raise DataError(result)
-            else:
-                failed[outcome.name] = result
-            advance()
-    return failed
+
+    names: dict[str, str] = field(default_factory=dict)
+    rules: Rules = field(default_factory=Rules)
+    tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: ["clean", "hard"])
+    block: Annotated[int, Ge(1)] = 30
+
+    def read(
+        self, classes: Sequence[str], work: Path
+    ) -> tuple[list[np.ndarray], list[ManifestRow]]:
+        """See `Importer`."""
+        limited = {*self.rules.limits} - {"default"}
+        if unknown := sorted({*self.names.values(), *limited} - {*classes}):
+            raise ConfigError(f"published.names or rules.limits: unknown classes {unknown}")
+        return super().read(classes, work)
+
+    def cut_of(self, name: str, origin: str, piece: Piece) -> Cut:
+        """What was cut of a thing that the dataset calls `name`."""
+        more, points, reason = {"sub": name}, len(piece.points_m), piece.why
+        if piece.refused:
+            points = piece.pixels
+        else:
+            more |= {"tier": piece.tier, "why": piece.why, "depth_m": f"{piece.depth_m:.3f}"}
+            more |= {key: f"{getattr(piece, key):.3f}" for key in ("holes", "rim", "occ")}
+            reason = "" if piece.tier in self.tiers else f"{piece.tier} ({piece.why})"
+        return Cut(self.names[name], origin, piece.points_m, points, reason, more)
+
+
+def _worker(dataset: CutDataset) -> Callable[[FrameTask], Part | str]:
+    """What cuts one frame and thins its objects, in whichever process."""
+    cut = dataset.cutter()
+
+    def work(task: FrameTask) -> Part | str:
+        try:
+            found = cut(task)
+        except Qs3Error as error:
+            return str(error)
+        clouds = {
+            str(i): thinned(one.points_m, dataset.points)
+            for i, one in enumerate(found)
+            if not one.reason
+        }
+        keys = ("cls", "origin", "pixels", "reason", "more", "views")
+        return {"objects": [{key: getattr(one, key) for key in keys} for one in found]}, clouds
+
+    return work
 
 
 def load_mat(path: Path) -> dict[str, Any]:
@@ -263,37 +290,3 @@ def load_mat(path: Path) -> dict[str, Any]:
     with reading(path):
         found: dict[str, Any] = loadmat(path, simplify_cells=True, mat_dtype=False)
     return found
-
-
-def _worker(dataset: FrameDataset) -> Callable[[FrameTask], Part | str]:
-    """What cuts one frame and thins its objects, in whichever process."""
-    cut = dataset.cutter()
-
-    def work(task: FrameTask) -> Part | str:
-        try:
-            found = cut(task)
-        except DataError as error:
-            return str(error)
-        clouds = {
-            str(i): thinned(one.piece.points_m, dataset.points)
-            for i, one in enumerate(found)
-            if not one.piece.refused
-        }
-        return {"objects": [_note(one) for one in found]}, clouds
-
-    return work
-
-
-def _note(one: Cut) -> dict[str, Any]:
-    piece = one.piece
-    more = {"sub": one.sub}
-    if not piece.refused:
-        more |= {"tier": piece.tier, "why": piece.why, "depth_m": f"{piece.depth_m:.3f}"}
-        more |= {key: f"{getattr(piece, key):.3f}" for key in ("holes", "rim", "occ")}
-    return {
-        "cls": one.cls,
-        "origin": one.origin,
-        "pixels": piece.pixels if piece.refused else len(piece.points_m),
-        "reason": piece.why if piece.refused else "",
-        "more": more,
-    }

@@ -82,6 +82,9 @@ class Importer(abc.ABC):
     complete: ClassVar[bool] = True
     """Whether a class without clouds in a split means that something is wrong."""
 
+    recorded: ClassVar[str] = "imported"
+    """The key of the settings in the store's meta.yaml."""
+
     thins: ClassVar[bool] = False
     """Whether larger clouds become their farthest points; else they are an error."""
 
@@ -188,7 +191,7 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
             classes=classes,
             arrays={"points": clouds},
             rows=rows,
-            meta={"imported": settings, **importer.made_of().meta},
+            meta={importer.recorded: settings, **importer.made_of().meta},
         )
         if folder.is_dir():  # holds a lock at most
             shutil.rmtree(folder)

@@ -212,10 +212,9 @@ class NYUv2(FrameDataset):
                 for instance in np.unique(instances[same & (instances > 0)]).tolist():
                     mask = same & (instances == instance)
                     mask |= self._contents(name, mask, labels, frames.names)
-                    cls = self.names[name]
-                    piece = cut(image, mask, cls, self.rules)
+                    piece = cut(image, mask, self.names[name], self.rules)
                     origin = f"{self.file}, frame {task.number}, {name} {instance}"
-                    cuts.append(Cut(cls, name, origin, piece))
+                    cuts.append(self.cut_of(name, origin, piece))
             return cuts
 
         return cut_frame

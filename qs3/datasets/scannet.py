@@ -3,238 +3,376 @@
 The paper (section 4, "Benchmarking Data") describes the dataset and no code for it was released.
 What is fixed there: instance masks crop the depth images, only crops of more than 1,000 points
 are kept, those of 10 viewpoints are fused, and 2,048 points are kept; scenes and split are those
-of PointDA-10's ScanNet10. What is not, is decided here and in `qs3.datasets.scannet_scene`.
+of PointDA-10's ScanNet10.
 
-The dataset depends on the scenes, the label map, the lists and the settings alone: neither the
-number of workers, nor their order, nor an interruption changes a byte of it. The parts, a scene
-each, stay next to the finished dataset: scenes that come later are added to them. They hold as much
-as the dataset, and may be deleted when it is complete.
+Each recording is passed over twice, with one frame in memory: the first pass finds which frames
+show enough of which object, and from where; the second crops the chosen ones.
+
+Masks have the colour camera's view. A depth pixel is back-projected with the depth intrinsics,
+taken to the colour camera by the extrinsics, and projected with the colour intrinsics, scaled to
+the mask's resolution. What the colour camera cannot see, because something nearer hides it from
+there and not from the depth camera, gets no mask pixel: it would get the label of what hides it.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
 import logging
-from collections import Counter
-from collections.abc import Callable, Sequence
-from functools import partial
-from importlib.metadata import version
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
+from annotated_types import Ge
+from jaxtyping import Bool, Float, Int, UInt
 
-from qs3.classes import CLASSES
-from qs3.datasets.frames import Part, finish_parts
+from qs3.datasets.frames import Cut, CutDataset, Cutter, FrameTask
 from qs3.datasets.scannet_files import (
+    INSTANCES,
+    LABELS,
+    SUFFIXES,
+    Labelled,
     LabelMap,
-    SceneFiles,
-    find_scenes,
+    MaskArchive,
+    SensFile,
+    SensHeader,
     read_label_map,
+    read_objects,
     read_scene_list,
 )
-from qs3.datasets.scannet_scene import Extraction, extract_scene
-from qs3.errors import DataError, Qs3Error
-from qs3.store.manifest import ManifestRow
-from qs3.store.meta import MadeOf, is_finished, read_meta
-from qs3.store.parts import RECIPE, PartFiles, check_ours, delete_dataset
-from qs3.store.store import PointSet, counts_text, open_pointset, write_pointset
-from qs3.utils.files import make_folder, sha256_file, write_text
-from qs3.utils.locks import locked
-from qs3.utils.pool import Pool, Processes
-from qs3.utils.text_table import csv_text
-from qs3.utils.version import VERSION
+from qs3.errors import DataError
+from qs3.store.meta import MadeOf
+from qs3.utils.files import reading
+from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
-SCENES = "scenes.csv"
-_COUNTS = ("frames", "frames_used", "frames_lost", "frames_unmasked")
-_FAILED: dict[str, Any] = {**dict.fromkeys(_COUNTS, 0), "objects": []}
+NEAR_M, FAR_M = 0.1, 10.0
+"""Depths outside are left out."""
 
-Result = tuple[SceneFiles, dict[str, Any], dict[str, np.ndarray]]
-"""A scene's files, its note and its clouds, or a note with the reason why it failed."""
+_MARGIN_PX = 1  # pixels around a mask's pixel that must show the same object, see `agreed`
+_FARTHER = 0.05  # of the depth: surfaces that differ by more are a nearer and a farther one
+# A cell of the nearest-surface map, in depth pixels: each cell of a visible surface gets a sample.
+_CELL_DEPTH_PX = 2.0
+_SAME_PLACE_M = 1e-6
 
 
-def extract(
-    *,
-    scans: Path,
-    labels: Path,
-    train: Path,
-    val: Path,
-    out: Path,
-    settings: Extraction | None = None,
-    force: bool = False,
-    pool: Pool | None = None,
-) -> PointSet:
-    """Make the dataset at `out`, continue it, add scenes that came since, or find it finished.
+@dataclass(frozen=True)
+class SceneTask(FrameTask):
+    """One scene: its folder, and the bytes of its files (another size means another file)."""
 
-    A second call with the same `out` waits for the first, and then finds its work. Scenes that fail
-    are in scenes.csv with the reason, and are tried again by the next call.
+    folder: Path = Path()
+    size: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of its part."""
+        return f"{self.folder.name}_{self.size}"
+
+    @property
+    def stem(self) -> str:
+        """Of its objects' ids."""
+        return self.folder.name
+
+
+@settings
+class ScanNet(CutDataset):
+    """Raw ScanNet: a folder of scenes; see the module and `qs3.datasets.scannet_files`.
+
+    Attributes:
+        labels: scannetv2-labels.combined.tsv, in the folder or by its whole path.
+        train, val: the lists of scenes, likewise; the second is our split "test".
+        min_points: a frame counts if it shows more points of the object than this.
+        views: frames fused, far from each other in direction; fewer if there are fewer.
+        stride: look at every n-th frame only; 10 takes a tenth of the time.
+    """
+
+    labels: str = "scannetv2-labels.combined.tsv"
+    train: str = "scannetv2_train.txt"
+    val: str = "scannetv2_val.txt"
+    min_points: Annotated[int, Ge(0)] = 1000
+    views: Annotated[int, Ge(1)] = 10
+    stride: Annotated[int, Ge(1)] = 1
+
+    recorded: ClassVar[str] = "extraction"
+
+    def files(self) -> Sequence[Path]:
+        """See `CutDataset`."""
+        return [self.root / name for name in (self.labels, self.train, self.val)]
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects="ScanNet's raw depth, cropped by its masks here")
+
+    def tasks(self) -> list[FrameTask]:
+        """See `CutDataset`: the scenes of the lists that are there."""
+        _, train, val = self.files()
+        split_of = dict.fromkeys(read_scene_list(train), "train")
+        split_of |= dict.fromkeys(read_scene_list(val), "test")
+        folders = [self.root / scene for scene in sorted(split_of)]
+        there = [folder for folder in folders if folder.is_dir()]
+        log.info("scenes that are there: %d of the lists' %d", len(there), len(folders))
+        return [
+            SceneTask(
+                number, split_of[at.name], at.name[:9], "structure", "given",
+                folder=at, size=sum(p.stat().st_size for p in _files(at) if p.is_file()),
+            )
+            for number, at in enumerate(there)
+        ]  # fmt: skip
+
+    def cutter(self) -> Cutter:
+        """See `CutDataset`."""
+        label_map = read_label_map(self.root / self.labels)
+        return lambda task: _extract(self, task, label_map)
+
+
+def _files(scene: Path) -> list[Path]:
+    """The recording, the masks of instances, those of labels, and the list of objects."""
+    return [scene / f"{scene.name}{suffix}" for suffix in SUFFIXES]
+
+
+def _extract(data: ScanNet, task: FrameTask, label_map: LabelMap) -> list[Cut]:
+    """The objects of a scene: points in the scene's world, metres, z up."""
+    assert isinstance(task, SceneTask)
+    sens, instances, labels, aggregation = _files(task.folder)
+    labelled = read_objects(aggregation, label_map)
+    with ExitStack() as stack:
+        scan = _Scan(
+            sens=stack.enter_context(SensFile(sens)),
+            instances=stack.enter_context(MaskArchive(instances, INSTANCES)),
+            labels=stack.enter_context(MaskArchive(labels, LABELS)),
+        )
+        every = range(0, len(scan.sens), data.stride)
+        frames = [f for f in every if scan.sens.has_pose(f) and f in scan.instances.frames]
+        if not frames:
+            raise DataError(f"{sens}: no frame has a finite pose and a mask")
+        sightings = _first_pass(scan, frames, labelled, data.min_points)
+        chosen = {one: sightings[one].viewpoints(data.views) for one in labelled}
+        crops = _second_pass(scan, chosen, label_map, data.min_points)
+    found = []
+    for one in labelled:
+        used = sorted(crops[one])
+        points = np.concatenate(
+            [np.empty((0, 3), np.float32), *(crops[one][frame] for frame in used)]
+        )
+        reason = ""
+        if not chosen[one]:
+            reason = f"no frame shows more than {data.min_points} of its points"
+        elif not used:
+            reason = "the label masks of its chosen frames give it another class"
+        origin = f"scene {task.stem}, object {one.object_id}, label {one.label!r}, frames "
+        origin += f"{' '.join(map(str, used)) or 'none'}, of {len(sightings[one].frames)}"
+        found.append(Cut(one.cls, origin, points, len(points), reason, {}, len(used)))
+    return found
+
+
+class Registration:
+    """The depth camera and the masks of one resolution."""
+
+    def __init__(self, header: SensHeader, mask_shape: tuple[int, int]) -> None:
+        """Prepare the rays for masks [h, w], which must have the shape of colour images."""
+        height, width = mask_shape
+        scale = (width / header.colour_px[0], height / header.colour_px[1])
+        # Half a pixel of slack: a halved image of odd height is rounded.
+        assert abs(scale[0] / scale[1] - 1) <= 1 / min(mask_shape), (
+            f"masks of {width} x {height} px do not fit colour images of {header.colour_px}"
+        )
+        k = header.colour_intrinsics
+        self._focal = (k[0, 0] * scale[0], k[1, 1] * scale[1])
+        self._skew = k[0, 1] * scale[0]
+        # Pixel centres are integers, so an image's edge is at -0.5.
+        self._centre = tuple((k[i, 2] + 0.5) * scale[i] - 0.5 for i in (0, 1))
+        self._mask_shape = mask_shape
+        u, v = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in header.depth_px))
+        pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
+        self._rays = pixels @ np.linalg.inv(header.depth_intrinsics).T
+        move = header.colour_from_depth
+        self._turned, self._shift = self._rays @ move[:3, :3].T, move[:3, 3]
+        self._parallax = bool(np.linalg.norm(self._shift) > _SAME_PLACE_M)
+        self._cell_px = _CELL_DEPTH_PX * max(1.0, self._focal[0] / header.depth_intrinsics[0, 0])
+
+    def mask_pixels(self, depth_m: Float[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
+        """Where each depth pixel falls in the mask: [h, w] int64, nearest position, flattened.
+
+        It is -1 outside the mask, where a thing is hidden from the colour camera, and where the
+        depth is 0 (nothing was measured), below `NEAR_M` or above `FAR_M`.
+        """
+        rows, cols = np.nonzero((depth_m >= NEAR_M) & (depth_m <= FAR_M))
+        at = self._turned[rows, cols] * depth_m[rows, cols, None].astype(np.float64) + self._shift
+        x, y, z = at.T
+        ahead = z > 0
+        safe = np.where(ahead, z, 1.0)
+        u = (self._focal[0] * x + self._skew * y) / safe + self._centre[0]
+        v = self._focal[1] * y / safe + self._centre[1]
+        height, width = self._mask_shape
+        seen = ahead & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        if self._parallax:
+            seen[seen] = self._visible(u[seen], v[seen], z[seen])
+        found = np.full(depth_m.shape, -1, dtype=np.int64)
+        col, row = np.rint(u[seen]).astype(np.int64), np.rint(v[seen]).astype(np.int64)
+        found[rows[seen], cols[seen]] = row * width + col
+        return found
+
+    def world(
+        self,
+        depth_m: Float[np.ndarray, "h w"],
+        keep: Bool[np.ndarray, "h w"],
+        pose: Float[np.ndarray, "4 4"],
+    ) -> Float[np.ndarray, "n 3"]:
+        """[n, 3] float64 world points of the pixels `keep`; `pose` is world_from_depth."""
+        local = self._rays[keep] * depth_m[keep, None].astype(np.float64)
+        return local @ pose[:3, :3].T + pose[:3, 3]
+
+    def _visible(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> Bool[np.ndarray, " n"]:
+        """[n] bool: nothing clearly nearer lies in the point's cell or one next to it.
+
+        The cells next to it stand for sides of a nearer thing that only the colour camera sees:
+        no depth was measured there. It costs what lies behind an edge a few pixels.
+        """
+        height, width = self._mask_shape
+        col = ((u + 0.5) / self._cell_px).astype(np.int64)
+        row = ((v + 0.5) / self._cell_px).astype(np.int64)
+        cells = (int(height / self._cell_px) + 1, int(width / self._cell_px) + 1)
+        nearest = np.full(cells[0] * cells[1], np.inf)
+        cell = row * cells[1] + col
+        np.minimum.at(nearest, cell, z)
+        around = cv2.erode(nearest.reshape(cells), np.ones((3, 3), np.uint8))
+        return z <= (1 + _FARTHER) * around.ravel()[cell]
+
+
+def agreed(mask: UInt[np.ndarray, "h w"]) -> UInt[np.ndarray, "h w"]:
+    """The mask, 0 where a pixel within `_MARGIN_PX` is of something else.
+
+    A ray that misses an object by less than a pixel must not be taken for it: what it hits lies
+    far behind, and farthest point sampling would keep every such point.
+    """
+    square = np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), np.uint8)
+    return np.where(cv2.erode(mask, square) == cv2.dilate(mask, square), mask, 0).astype(mask.dtype)
+
+
+@dataclass(eq=False)
+class Sightings:
+    """What the first pass notes of one object: the frames that show enough of it.
+
+    Attributes:
+        frames, eyes_m, counts, sums_m: of each such frame its number, the camera's position [3],
+            the number of the object's points, and their sum [3] in the world.
+    """
+
+    frames: list[int] = field(default_factory=list)
+    eyes_m: list[np.ndarray] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
+    sums_m: list[np.ndarray] = field(default_factory=list)
+
+    def see(self, frame: int, points_m: np.ndarray, eye_m: np.ndarray, more_than: int) -> None:
+        """Note a frame: [n, 3] points of the object in the world, [3] the camera's position."""
+        if len(points_m) > more_than:
+            self.frames.append(frame)
+            self.eyes_m.append(eye_m)
+            self.counts.append(len(points_m))
+            self.sums_m.append(points_m.sum(axis=0))
+
+    def viewpoints(self, count: int) -> tuple[int, ...]:
+        """Well-spread frames, ascending; see `spread`."""
+        if not self.frames:
+            return ()
+        centre = np.sum(self.sums_m, axis=0) / sum(self.counts)
+        chosen = spread(np.array(self.eyes_m) - centre, self.counts, count)
+        return tuple(sorted(self.frames[i] for i in chosen))
+
+
+def spread(towards_m: Float[np.ndarray, "n 3"], points: Sequence[int], count: int) -> list[int]:
+    """Up to `count` viewpoints, in order: farthest point sampling of their directions.
+
+    The first is the frame with most points; each next one is that whose direction from the
+    object is farthest from those of all taken. Of equals the earliest is taken.
 
     Args:
-        scans: ScanNet's folder of scenes, which all of the pool's machines see.
-        labels: scannetv2-labels.combined.tsv.
-        train, val: scannetv2_train.txt and scannetv2_val.txt; the latter is our split "test".
-        out: folder of the dataset.
-        settings: None is the defaults.
-        force: delete first what an earlier call left at `out`.
-        pool: of processes; None: this one.
-
-    Raises:
-        ConfigError: `out` was made with other settings.
-        MissingDataError: a file or the folder of scenes is not there.
-        DataError: no object gave a cloud, or `out` holds a dataset of other origin.
+        towards_m: from the object's centre to the camera of each frame.
+        points: of the object in each frame.
+        count: of viewpoints.
     """
-    settings = settings or Extraction()
-    scans, out = scans.absolute(), out.absolute()
-    label_map = read_label_map(labels, settings.column)
-    scenes = find_scenes(scans, read_scene_list(train), read_scene_list(val))
-    recipe = {
-        "settings": dataclasses.asdict(settings),
-        "labels": {"sha256": sha256_file(labels)},
-        "versions": _versions(),
-    }
-    make_folder(out)
-    with locked(out / ".lock"):
-        check_ours(out, "qs3 scannet")
-        if force and (is_finished(out) or (out / RECIPE).is_file()):
-            (out / SCENES).unlink(missing_ok=True)
-            delete_dataset(out)
-        parts = PartFiles(out)
-        if is_finished(out) and not parts.are_there:
-            parts.check(recipe)
-            log.info("%s is finished, and its parts were deleted: nothing to do", out)
-            return open_pointset(out)
-        parts.begin(recipe)
-        todo = [(files.scene, files) for files in scenes if not _done(parts, files)]
-        make = partial(_worker, label_map, settings, recipe["versions"])
-        failed = finish_parts(parts, todo, make, pool or Processes(0), "scenes", stop=False)
-        results = [
-            (files, {**_FAILED, "reason": failed[files.scene]}, {})
-            if files.scene in failed
-            else (files, *parts.read(files.scene))
-            for files in scenes
-        ]
-        pointset = _write(out, scans, results, recipe)
-        _report(pointset, results, out)
-    return pointset
+    length = np.linalg.norm(towards_m, axis=1, keepdims=True)
+    directions = towards_m / np.where(length > 0, length, 1.0)
+    chosen = [int(np.argmax(points))]
+    gap = np.full(len(directions), np.inf)
+    while len(chosen) < min(count, len(directions)):
+        gap = np.minimum(gap, np.linalg.norm(directions - directions[chosen[-1]], axis=1))
+        gap[chosen] = -1.0  # also where all stand at one place
+        chosen.append(int(np.argmax(gap)))
+    return chosen
 
 
-def _worker(
-    label_map: LabelMap, settings: Extraction, versions: dict[str, str]
-) -> Callable[[SceneFiles], Part | str]:
-    """What a process does with each scene."""
-    if (here := _versions()) != versions:
-        raise DataError(f"a worker's machine has {here}, this one {versions}")
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """The open files of a scene, and where depth pixels fall in masks of each size so far."""
 
-    def work(files: SceneFiles) -> Part | str:
-        try:
-            return extract_scene(files, label_map, settings)
-        except Qs3Error as error:
-            return str(error)
-        except Exception as error:  # one odd scene must not stop a thousand
-            log.exception("%s: unexpected error", files.scene)
-            return f"unexpected {type(error).__name__}: {error}"
+    sens: SensFile
+    instances: MaskArchive
+    labels: MaskArchive
+    known: dict[tuple[int, int], Registration] = field(default_factory=dict)
 
-    return work
-
-
-def _done(parts: PartFiles, files: SceneFiles) -> bool:
-    """Whether there is a part of the scene, made from files of these sizes for this split."""
-    if not parts.has(files.scene):
-        return False
-    note, _ = parts.open(files.scene)
-    return note["split"] == files.split and note["sizes"] == files.sizes()
+    def see(
+        self, frame: int, mask: np.ndarray
+    ) -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
+        """The cameras; [h, w] depth, mask of each depth pixel (or 0), and its position there."""
+        shape = (mask.shape[0], mask.shape[1])
+        if shape not in self.known:
+            with reading(f"{self.instances.path}, frame {frame}"):
+                self.known[shape] = Registration(self.sens.header, shape)
+        registration, depth_m = self.known[shape], self.sens.depth_m(frame)
+        where = registration.mask_pixels(depth_m)
+        return registration, depth_m, np.where(where >= 0, agreed(mask).ravel()[where], 0), where
 
 
-def _write(out: Path, scans: Path, results: Sequence[Result], recipe: dict[str, Any]) -> PointSet:
-    """The dataset, unless it is there already with exactly these scenes."""
-    table = _scenes_csv(results, scans)
-    digest = hashlib.sha256(table.encode()).hexdigest()
-    if is_finished(out) and read_meta(out).get("scenes_sha256") == digest:
-        log.info("nothing has changed since %s was written", out)
-        return open_pointset(out)
-    found = [
-        (files, one, clouds.get(str(one["object_id"])))
-        for files, note, clouds in results
-        for one in note["objects"]
-    ]
-    # Class by class, train before test, as the other datasets.
-    found.sort(key=lambda f: (CLASSES.index(f[1]["cls"]), f[0].split == "test"))
-    clouds = [cloud for _, _, cloud in found if cloud is not None]
-    if not clouds:
-        why = [f"{files.scene}: {note['reason']}" for files, note, _ in results if "reason" in note]
-        raise DataError("\n  ".join([f"no object of {len(results)} scenes gave a cloud", *why[:5]]))
-    write_text(out / SCENES, table)
-    return write_pointset(
-        out,
-        name=out.name,
-        classes=CLASSES,
-        arrays={"points": clouds},
-        rows=[_row(files, one) for files, one, _ in found],
-        meta={
-            "simulated": False,
-            **MadeOf(objects="ScanNet's raw depth, cropped by its masks here").meta,
-            "scenes": len(results),
-            "scenes_failed": sum("reason" in note for _, note, _ in results),
-            "scenes_sha256": digest,
-            **{"extraction" if key == "settings" else key: value for key, value in recipe.items()},
-        },
-    )
+def _first_pass(
+    scan: _Scan, frames: Sequence[int], labelled: Sequence[Labelled], min_points: int
+) -> dict[Labelled, Sightings]:
+    """How much of which object each frame shows."""
+    sightings = {one: Sightings() for one in labelled}
+    for frame in frames:
+        mask = scan.instances.read(frame)
+        there = np.flatnonzero(np.bincount(mask.ravel()))
+        shown = [one for one in labelled if one.object_id + 1 in there]
+        if not shown:
+            continue
+        registration, depth_m, ids, _ = scan.see(frame, mask)
+        pose = scan.sens.poses[frame]
+        for one in shown:
+            points = registration.world(depth_m, ids == one.object_id + 1, pose)
+            sightings[one].see(frame, points, pose[:3, 3], min_points)
+    return sightings
 
 
-def _row(files: SceneFiles, one: dict[str, Any]) -> ManifestRow:
-    """The manifest's row; `origin` says scene, object, label and frames."""
-    number, frames = one["object_id"], " ".join(map(str, one["frames"])) or "none"
-    return ManifestRow(
-        id=f"{one['cls']}/{files.split}/{files.scene}_{number}",
-        cls=one["cls"],
-        split=files.split,
-        origin=f"scene {files.scene}, object {number}, label {one['label']!r}, "
-        f"frames {frames}, of {one['candidates']}",
-        views=len(one["frames"]),
-        valid_points=one["fused_points"],
-        status="skipped" if one["reason"] else "ok",
-        reason=one["reason"],
-    )
+def _second_pass(
+    scan: _Scan,
+    chosen: Mapping[Labelled, Sequence[int]],
+    label_map: LabelMap,
+    min_points: int,
+) -> dict[Labelled, dict[int, np.ndarray]]:
+    """The crops of the chosen frames whose label masks do not deny the class.
 
-
-def _scenes_csv(results: Sequence[Result], scans: Path) -> str:
-    """One line a scene; paths in it are relative to `scans`, so it is the same anywhere."""
-    rows: list[Sequence[Any]] = [
-        ("scene", "split", "status", "objects", "clouds", *_COUNTS, "sha256", "notes")
-    ]
-    for files, note, clouds in results:
-        digest = hashlib.sha256(repr(note["objects"]).encode())
-        for key in sorted(clouds):
-            digest.update(clouds[key].tobytes())
-        status = "failed" if "reason" in note else "ok"
-        notes = "; ".join([note["reason"]] if "reason" in note else note["notes"])
-        row = [files.scene, files.split, status, len(note["objects"]), len(clouds)]
-        row += [note[key] for key in _COUNTS]
-        rows.append([*row, digest.hexdigest()[:16], notes.replace(f"{scans}/", "")])
-    return csv_text(rows)
-
-
-def _versions() -> dict[str, str]:
-    """What may change a number in a cloud."""
-    return {
-        "qs3": VERSION,
-        "numpy": np.__version__,
-        "opencv": cv2.__version__,
-        "fpsample": version("fpsample"),
-    }
-
-
-def _report(pointset: PointSet, results: Sequence[Result], out: Path) -> None:
-    """Counts a class, what was left out, and the content hash."""
-    missed = (one["cls"] for _, note, _ in results for one in note["objects"] if one["reason"])
-    for line in counts_text(pointset, "skipped", Counter(missed)):
-        log.info("%s", line)
-    lost = sum(note["frames_lost"] for _, note, _ in results)
-    log.info("frames left out for their pose: %d", lost)
-    if failed := sum("reason" in note for _, note, _ in results):
-        log.warning("%d of %d scenes failed; %s says why", failed, len(results), SCENES)
-    log.info("in %s, content hash %s", out, pointset.sha256[:16])
+    A pixel counts if the label mask gives it the object's class; a frame counts if more than
+    `min_points` of its pixels and more than half of them do.
+    """
+    crops: dict[Labelled, dict[int, np.ndarray]] = {one: {} for one in chosen}
+    of_frame: dict[int, list[Labelled]] = defaultdict(list)
+    for one, frames in chosen.items():
+        for frame in frames:
+            of_frame[frame].append(one)
+    for frame in sorted(of_frame):
+        mask, labels = scan.instances.read(frame), scan.labels.read(frame)
+        registration, depth_m, ids, where = scan.see(frame, mask)
+        if labels.shape != mask.shape:
+            raise DataError(f"{scan.labels.path}, frame {frame}: another size than the instances'")
+        for one in of_frame[frame]:
+            keep = ids == one.object_id + 1
+            fitting = [n for n, cls in label_map.class_of_id.items() if cls == one.cls]
+            agrees = keep & np.isin(labels.ravel()[where], fitting)
+            if 2 * agrees.sum() > keep.sum() and agrees.sum() > min_points:
+                points = registration.world(depth_m, agrees, scan.sens.poses[frame])
+                crops[one][frame] = points.astype(np.float32)
+    return crops

@@ -38,7 +38,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +48,6 @@ import numpy as np
 from jaxtyping import Float, UInt
 
 from qs3.classes import ALIASES, CLASSES
-from qs3.errors import DataError
 from qs3.utils.files import reading
 
 log = logging.getLogger(__name__)
@@ -60,12 +59,11 @@ NAMES: tuple[str, ...] = (
 
 INSTANCES, LABELS = "instance-filt", "label-filt"
 
-_SUFFIXES = {
-    "sens": ".sens",
-    "instances": f"_2d-{INSTANCES}.zip",
-    "labels": f"_2d-{LABELS}.zip",
-    "aggregation": ".aggregation.json",
-}
+SUFFIXES: tuple[str, ...] = (
+    ".sens", f"_2d-{INSTANCES}.zip", f"_2d-{LABELS}.zip", ".aggregation.json",
+)  # fmt: skip
+"""Of the files of a scene, after its name."""
+
 _CLASS_OF = {name: ALIASES.get(name, name) for name in NAMES}
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
 _START, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
@@ -221,56 +219,6 @@ class MaskArchive:
 
 
 @dataclass(frozen=True)
-class SceneFiles:
-    """A scene's files; those that are not there are None.
-
-    Attributes:
-        scene: its name, e.g. "scene0000_00".
-        split: "train" or "test".
-        sens, instances: the recording and the zip of instance masks; both are needed.
-        aggregation: the list of objects; needed.
-        labels: the zip of label masks, which checks the classes.
-    """
-
-    scene: str
-    split: str
-    sens: Path | None
-    instances: Path | None
-    labels: Path | None
-    aggregation: Path | None
-
-    @staticmethod
-    def find(folder: Path, split: str) -> SceneFiles:
-        """Those in a scene's folder, under ScanNet's names."""
-        paths = {role: folder / f"{folder.name}{suffix}" for role, suffix in _SUFFIXES.items()}
-        there = {role: path if path.is_file() else None for role, path in paths.items()}
-        return SceneFiles(folder.name, split, **there)
-
-    def need(self, role: str) -> Path:
-        """The file of a role, such as "sens"; DataError if it is not there."""
-        path: Path | None = getattr(self, role)
-        if path is None:
-            raise DataError(f"{self.scene}{_SUFFIXES[role]} is not there; download it")
-        return path
-
-    def sizes(self) -> dict[str, int]:
-        """Bytes of each file, by its role: another size means another file."""
-        paths = {role: getattr(self, role) for role in _SUFFIXES}
-        return {role: path.stat().st_size for role, path in paths.items() if path is not None}
-
-
-def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> list[SceneFiles]:
-    """The scenes in `scans`, one folder each, with the split that the lists of names give them."""
-    if both := sorted(set(train) & set(test)):
-        raise DataError(f"scenes in the lists of train and of test: {', '.join(both[:5])}")
-    split_of = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
-    folders = sorted(path for path in scans.glob("scene*") if path.name in split_of)
-    scenes = [SceneFiles.find(path, split_of[path.name]) for path in folders if path.is_dir()]
-    log.info("scenes that are there: %d of the lists' %d", len(scenes), len(split_of))
-    return scenes
-
-
-@dataclass(frozen=True)
 class LabelMap:
     """The label map, as far as the ten classes need it.
 
@@ -298,46 +246,40 @@ class Labelled:
     cls: str
 
 
-def read_label_map(path: Path, column: str = "category") -> LabelMap:
-    """Read scannetv2-labels.combined.tsv (or ScanNet v1's, whose `category` is the raw word).
-
-    `column` has the words that are compared with `NAMES`: "category" (tidied) or "raw_category".
-    """
+def read_label_map(path: Path) -> LabelMap:
+    """Read scannetv2-labels.combined.tsv."""
     by_label, by_id = {}, {}
     with reading(path):
-        rows = csv.DictReader(
-            path.read_text(errors="replace").splitlines(), delimiter="\t", quoting=csv.QUOTE_NONE
-        )
-        raw = "raw_category" if "raw_category" in (rows.fieldnames or []) else "category"
-        for row in rows:
-            if cls := _CLASS_OF.get(row[column].strip()):
-                by_label[row[raw].strip()] = cls
+        lines = path.read_text(errors="replace").splitlines()
+        for row in csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE):
+            if cls := _CLASS_OF.get(row["category"].strip()):
+                by_label[row["raw_category"].strip()] = cls
                 by_id[int(row["id"])] = cls
         absent = sorted(set(CLASSES) - set(by_label.values()))
-        assert not absent, f"no label of the classes {', '.join(absent)} in {column!r}"
+        assert not absent, f"no label of the classes {', '.join(absent)}"
     return LabelMap(by_label, by_id)
 
 
-def read_objects(path: Path, label_map: LabelMap) -> tuple[list[Labelled], list[str]]:
-    """The objects of the ten classes in an aggregation.json, by `objectId`, and what is odd.
+def read_objects(path: Path, label_map: LabelMap) -> list[Labelled]:
+    """The objects of the ten classes in an aggregation.json, by `objectId`.
 
-    Odd is the same `objectId` under labels of different classes; such an object is left out.
+    One that has labels of different classes is left out.
     """
-    with reading(path):
-        groups = json.loads(path.read_text())["segGroups"]
-        named = [(int(group["objectId"]), group["label"].strip()) for group in groups]
     found: dict[int, tuple[str, str | None]] = {}
     torn = set()
-    for number, label in named:
-        cls = label_map.class_of_label.get(label)
-        if found.setdefault(number, (label, cls))[1] != cls:
-            torn.add(number)
-    objects = [
+    with reading(path):
+        for group in json.loads(path.read_text())["segGroups"]:
+            number, label = int(group["objectId"]), group["label"].strip()
+            cls = label_map.class_of_label.get(label)
+            if found.setdefault(number, (label, cls))[1] != cls:
+                torn.add(number)
+    if torn:
+        log.warning("%s: objects with labels of two classes: %s", path, sorted(torn))
+    return [
         Labelled(number, label, cls)
         for number, (label, cls) in sorted(found.items())
         if cls is not None and number not in torn
     ]
-    return objects, [f"objectId {number} has labels of two classes" for number in sorted(torn)]
 
 
 def read_scene_list(path: Path) -> list[str]:

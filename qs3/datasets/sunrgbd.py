@@ -168,15 +168,15 @@ class SUNRGBD(FrameDataset):
             image = open_image(self.root, frame)
             cuts = []
             for number, one in enumerate(wanted, start=1):
-                cls = self.names[one.name]
                 if one.box is None:
                     nothing = np.zeros((0, 3), np.float32)
                     why = "its numbers are not those of a box"
                     piece = Piece(nothing, np.zeros(0, bool), 0, 1.0, why=why, refused=True)
                 else:
                     mask = box_mask(image, one.box, self.rules)
-                    piece = cut(image, mask, cls, self.rules, edge_px=0)
-                cuts.append(Cut(cls, one.name, f"{frame.folder}, {one.name} {number}", piece))
+                    piece = cut(image, mask, self.names[one.name], self.rules, edge_px=0)
+                origin = f"{frame.folder}, {one.name} {number}"
+                cuts.append(self.cut_of(one.name, origin, piece))
             return cuts
 
         return cut_frame
