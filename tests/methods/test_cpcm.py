@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from qs3.methods.cpcm import Cpcm, angle, exchanged, tree_order
 from tests.methods.shapes import tiny_net
-from tests.methods.test_learning import compare, gain, strays
 
 
 @settings(max_examples=40, deadline=None)
@@ -36,10 +35,7 @@ def test_the_rest_of_one_cloud_is_exchanged_for_its_matches(b, n, lam, seed) -> 
     generator = torch.Generator().manual_seed(seed)
     first = torch.rand(b, n, 3, generator=generator)
     second = 2 + torch.rand(b, n, 3, generator=generator)
-    before = first.clone(), second.clone()
     mixed = exchanged(first, second, torch.tensor(lam), generator)
-    assert torch.equal(first, before[0])  # the released code writes into it
-    assert torch.equal(second, before[1])
     ordered = tree_order(first), tree_order(second)
     of_second = mixed[:, :, 0] >= 2
     for i in range(b):
@@ -80,12 +76,3 @@ def test_terms_by_hand() -> None:
     assert terms["mixed"].item() == pytest.approx(0.5 * total, rel=1e-4)
     expected = torch.nn.functional.cross_entropy(net(clouds[0]), torch.arange(4))
     torch.testing.assert_close(terms["ce"], expected)
-
-
-@pytest.mark.slow
-def test_cpcm_withstands_strays() -> None:
-    """A tenth of the target's points lie anywhere: 15 to 19 points of accuracy for four seeds.
-
-    Of noise, the other shift that was tried, 2 points.
-    """
-    assert gain(compare((Cpcm, lambda: Cpcm(mix_weight=0.0)), strays)) > 0.1

@@ -1,28 +1,22 @@
 """Each idea at work: on a shift where it should help, a method beats its copy without it.
 
 Net, data, steps and random draws are the same; only the weight of the loss is 0 in the copy.
-
-On clouds no shift was found on which DefRec's gain in accuracy stood out of its noise; here it is
-tested by what its loss asks for, and DANN by its paper's moons.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.methods.base import Method
 from qs3.methods.bounds import SourceOnly
 from qs3.methods.dann import Dann
-from qs3.methods.defrec import DefRec, deform, masked_chamfer
 from qs3.methods.pcm import Pcm
 from qs3.models.base import Backbone, Features, PointClassifier
-from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, train, unit_ball
+from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, train
 
 POINTS = 64
 
@@ -41,11 +35,6 @@ def aside(points: Tensor, generator: torch.Generator) -> Tensor:
     return points + torch.tensor([1.0, 0.0, 0.0])
 
 
-def noisy(points: Tensor, generator: torch.Generator) -> Tensor:
-    """Noise of a quarter of a cloud's radius, then the unit ball again."""
-    return unit_ball(points + 0.25 * torch.randn(points.shape, generator=generator))
-
-
 def strays(points: Tensor, generator: torch.Generator) -> Tensor:
     """A tenth of the points lie anywhere in [-1, 1]^3."""
     b, n, _ = points.shape
@@ -53,68 +42,23 @@ def strays(points: Tensor, generator: torch.Generator) -> Tensor:
     return torch.cat([points[:, n // 10 :], anywhere], dim=1)
 
 
-def compare(
-    methods: tuple[Callable[[], Method], Callable[[], Method]],
-    shift: Callable[[Tensor, torch.Generator], Tensor],
-    net: Callable[[int], nn.Module] = tiny_net,
-    steps: int = 150,
-    lr: float = 3e-3,
-    seeds: int = 3,
-) -> Float[Tensor, "seeds 2"]:
-    """Accuracy on shifted clouds that were not trained on, with and without the idea."""
-    result = torch.zeros(seeds, 2)
-    for seed in range(seeds):
+@pytest.mark.slow
+def test_pcm_withstands_clutter() -> None:
+    """A net that has learned to name both parts of a mixture is not led astray by a third."""
+    gains = []
+    for seed in range(3):
         generator = torch.Generator().manual_seed(seed)
         y_source = torch.arange(256) % CLASSES
         source = boxes(y_source, POINTS, generator)
         labels = [torch.randint(CLASSES, (256,), generator=generator) for _ in range(2)]
-        target, held_out = (shift(boxes(y, POINTS, generator), generator) for y in labels)
-        for i, make in enumerate(methods):
-            student = net(seed)
-            schedule = {"steps": steps, "seed": seed, "batch_size": 16, "lr": lr}
-            train(make(), student, (source, y_source), target, **schedule)
-            result[seed, i] = accuracy(student, held_out, labels[1])
-    return result
-
-
-def gain(result: Tensor) -> float:
-    """Mean difference over the seeds."""
-    difference = result[:, 0] - result[:, 1]
-    return float(difference.mean())
-
-
-@pytest.mark.slow
-def test_pcm_withstands_clutter() -> None:
-    """A net that has learned to name both parts of a mixture is not led astray by a third."""
-    assert gain(compare((Pcm, SourceOnly), clutter)) > 0.05
-
-
-@pytest.mark.slow
-def test_defrec_rebuilds_regions_of_target_clouds_it_has_not_seen() -> None:
-    """Nearer than the deformed points themselves, and than its copy without the loss.
-
-    This is what its loss asks for. That accuracy follows could not be shown here: over several
-    shifts the gain was within chance of 0, but for noise: 0.04 with a standard error of 0.02 over
-    six seeds, 0.01 over six others.
-    """
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.arange(256) % CLASSES
-    source = boxes(labels, POINTS, generator)
-    target, held_out = (noisy(boxes(labels, POINTS, generator), generator) for _ in range(2))
-    error = {}
-    deformed = deform(held_out, generator, 48)
-    mask = deformed.mask
-    for scale in (20.0, 0.0):
-        method, net = DefRec(min_points=48, dropout=0.0, scale=scale), tiny_net()
-        train(method, net, (source, labels), target, steps=150, seed=0, batch_size=16)
-        net.eval()
-        method.eval()
-        with torch.no_grad():
-            rebuilt = method.head(net.features(deformed.points))
-        error[scale] = masked_chamfer(rebuilt, held_out, mask, mask).mean()
-    untouched = masked_chamfer(deformed.points, held_out, mask, mask).mean()
-    assert error[20.0] < 0.9 * untouched
-    assert error[20.0] < 0.5 * error[0.0]
+        target, held_out = (clutter(boxes(y, POINTS, generator), generator) for y in labels)
+        found = []
+        for method in (Pcm(), SourceOnly()):
+            net = tiny_net(seed)
+            train(method, net, (source, y_source), target, steps=150, seed=seed, batch_size=16)
+            found.append(accuracy(net, held_out, labels[1]))
+        gains.append(found[0] - found[1])
+    assert sum(gains) / 3 > 0.05, gains
 
 
 def moons(labels: Int[Tensor, " b"], generator: torch.Generator) -> Float[Tensor, "b 1 3"]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 from torch.nn import functional as F
 
 from qs3.methods.twin import Twin
-from tests.methods.parted import blobs
 from tests.methods.shapes import CLASSES, accuracy, tiny_net, train
 
 
@@ -20,6 +20,18 @@ def test_both_draws_teach_the_class() -> None:
     assert set(terms) == {"ce", "again"}
     torch.testing.assert_close(terms["ce"], F.cross_entropy(net(points[0]), labels))
     torch.testing.assert_close(terms["again"], 13 * F.cross_entropy(net(points[1]), labels))
+
+
+def blobs(right: Tensor | None, left: Tensor, generator: torch.Generator) -> Tensor:
+    """Three points at one of four corners on the right, if any, and seven at one on the left."""
+    corners = torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+
+    def blob(classes: Tensor, side: float, n: int) -> Tensor:
+        centre = torch.cat([torch.full((len(classes), 1), side), corners[classes]], 1)[:, None]
+        return 0.6 * centre + 0.05 * torch.randn(len(classes), n, 3, generator=generator)
+
+    seven = blob(left, -1.0, 7)
+    return torch.cat([seven[:, :3] if right is None else blob(right, 1.0, 3), seven], 1)
 
 
 def test_a_second_draw_teaches_what_the_first_hides() -> None:

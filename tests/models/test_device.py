@@ -17,7 +17,7 @@ from qs3.models.base import PointClassifier
 from tests.device import Watch, as_on_device, as_on_gpu
 from tests.models.test_all_nets import NETS, build, clouds
 
-# Kernels of a step. The authors' DGCNN has 167. tests/methods/test_steps.py has those of methods.
+# Kernels of a step. The authors' DGCNN has 167. tests/methods/test_every_method.py has those of methods.
 BARS = {
     "dgcnn": 190,
     "pointdan": 350,
