@@ -14,14 +14,11 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from qs3.config.hashing import config_sha256
 from qs3.geometry.neighbours import knn
-from qs3.kernels.device import exact_products
 from qs3.methods.defrec import masked_chamfer, nearest
 from qs3.methods.gast import turn_parts
 from qs3.methods.mlsp import cardinalities, normals_of
 from qs3.methods.pointdan import mmd2
-from tests.composing import compose
 from tests.device import as_on_device
 from tests.models.test_all_nets import build, each_net
 
@@ -50,18 +47,6 @@ def high() -> Iterator[None]:
     torch.set_float32_matmul_precision("high")
     yield
     torch.set_float32_matmul_precision(before)
-
-
-def _fails_inside() -> None:
-    with exact_products():
-        assert torch.get_float32_matmul_precision() == "highest"
-        raise ZeroDivisionError
-
-
-def test_afterwards_it_is_as_before() -> None:
-    with pytest.raises(ZeroDivisionError):
-        _fails_inside()
-    assert torch.get_float32_matmul_precision() == "high"
 
 
 def test_distances_and_turns_of_methods_are_exact() -> None:
@@ -101,13 +86,3 @@ def test_nets_round_layers_but_no_coordinates(name: str) -> None:
     assert set(turns) | set(distances) <= {"highest"}
     assert len(turns) == (name in ("dgcnn", "pointnet", "pointdan"))
     assert len(distances) == {"dgcnn": 5, "pointdan": 1}.get(name, 0)
-
-
-def test_only_rounded_runs_are_other_runs() -> None:
-    def sha256(*words: str) -> str:
-        return config_sha256(compose("train", ["trainer=gpu", *words]))
-
-    plain = sha256()
-    assert sha256("trainer.float32_matmul=highest") == plain == sha256("~trainer.float32_matmul")
-    assert sha256("trainer.float32_matmul=high") != plain
-    assert sha256("trainer.cuda_graphs=false") == plain == sha256("~trainer.cuda_graphs")

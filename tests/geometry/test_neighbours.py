@@ -25,19 +25,6 @@ def _assert_nearest(x: torch.Tensor, index: torch.Tensor, atol: float = 1e-9) ->
     assert (index.sort(dim=2)[0].diff(dim=2) > 0).all()
 
 
-@pytest.mark.parametrize(
-    ("n", "c", "k"),
-    [(1, 3, 1), (30, 3, 5), (191, 4, 20), (192, 4, 20), (500, 3, 20), (333, 16, 33), (256, 8, 1)],
-)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_knn_equals_brute_force(n: int, c: int, k: int, dtype: torch.dtype) -> None:
-    torch.manual_seed(0)
-    x = torch.randn(2, n, c, dtype=dtype)
-    index = knn(x, k)
-    _assert_nearest(x.double(), index, atol=1e-4 if dtype == torch.float32 else 1e-9)
-    assert torch.equal(index[:, :, 0], torch.arange(n).expand(2, n))  # itself
-
-
 @pytest.mark.parametrize("equal", [0, 1, 60, 200])
 def test_smallest_sums_of_rows_that_are_mostly_equal(equal: int) -> None:
     """Of `equal` columns that share the least value the first come first."""
@@ -75,7 +62,7 @@ def test_knn_far_from_origin_and_in_half_precision() -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(1, 260), st.integers(1, 12), st.integers(0, 10_000), st.booleans())
+@given(st.integers(1, 260), st.integers(1, 33), st.integers(0, 10_000), st.booleans())
 def test_knn_of_anything(n: int, k: int, seed: int, grid: bool) -> None:
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(2, n, 3, generator=generator, dtype=torch.float64)
@@ -85,6 +72,7 @@ def test_knn_of_anything(n: int, k: int, seed: int, grid: bool) -> None:
     index = knn(x, k)
     _assert_nearest(x, index)
     if not grid:
+        assert torch.equal(index[:, :, 0], torch.arange(n).expand(2, n))  # itself
         order = torch.randperm(n, generator=generator)
         assert torch.equal(order[knn(x[:, order], k)], index[:, order])  # equivariant
 

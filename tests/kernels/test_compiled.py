@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -93,21 +90,3 @@ def test_torchs_compiler_knows_them():
     torch.library.opcheck(compiled.linear_max_backward, of_layer, test_utils=checks)
     sums = torch.randn(6, 200), torch.randn(2, 200), 20
     torch.library.opcheck(compiled.smallest_sums, sums, test_utils=checks)
-
-
-FORKED = """
-import os, torch
-from qs3.kernels import compiled
-torch.set_num_threads(2)
-x, index = torch.randn(500, 64), torch.randint(500, (4000, 20))
-best, _ = compiled.neighbour_max(x, index)
-if os.fork() == 0:
-    os._exit(0 if torch.equal(compiled.neighbour_max(x, index)[0], best) else 1)
-print(os.waitstatus_to_exitcode(os.wait()[1]))
-"""
-
-
-def test_a_fork_has_threads_of_its_own():
-    run = [sys.executable, "-c", FORKED]
-    said = subprocess.run(run, capture_output=True, text=True, check=True, timeout=60)
-    assert said.stdout.split() == ["0"]

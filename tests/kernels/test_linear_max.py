@@ -43,16 +43,6 @@ def test_lists_name_each_row_s_entries_in_order(rows: int) -> None:
             assert mine.tolist() == (given == row).nonzero()[:, 0].tolist()
 
 
-@pytest.mark.slow
-def test_operations_are_as_torch_wants_them() -> None:
-    x, weight = _inputs(2, 9, 4, 6, torch.float32)
-    where = (x @ weight.T).max(1)[1]
-    first, order = lists_of(where, 9)
-    grad, beside = torch.randn(2, 12), torch.randn(2, 4)
-    torch.library.opcheck(linear_max.points_gradient, (grad, weight, beside, first, order))
-    torch.library.opcheck(linear_max.weight_gradient, (grad, x, where, weight))
-
-
 # Channels that fill no block, a point that has many maxima, and gradients of more than the maxima.
 COMPARE = """
 import torch

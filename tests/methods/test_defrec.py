@@ -2,12 +2,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import nn
 
 from qs3.methods.defrec import (
     VOXELS,
     DefRec,
-    ReconstructionHead,
     cloud_size,
     deform,
     masked_chamfer,
@@ -16,7 +14,6 @@ from qs3.methods.defrec import (
 )
 from qs3.methods.gast import Gast
 from qs3.methods.mlsp import Mlsp
-from qs3.models.base import Features
 from tests.methods.shapes import tiny_net
 
 
@@ -27,17 +24,6 @@ def _batch() -> dict:
         "source": {"points": clouds, "y_source": torch.tensor([0, 1, 2, 3])},
         "target": {"points": clouds.flip(0)},
     }
-
-
-def test_head_is_the_layer_on_concatenated_features() -> None:
-    head = ReconstructionHead(tiny_net(), dropout=0.5).eval()
-    features = Features(torch.randn(3, 64), torch.randn(3, 10, 32))
-    assert features.per_point is not None
-    both = torch.cat([features.per_point, features.global_[:, None].expand(-1, 10, -1)], dim=2)
-    first = nn.Linear(96, 256, bias=False)
-    first.weight = nn.Parameter(torch.cat([head.of_point, head.of_cloud], dim=1))
-    expected = head.rest(first(both).flatten(0, 1)).view(3, 10, 3)
-    torch.testing.assert_close(head(features), expected)
 
 
 def test_the_loss_is_of_the_deformed_points_alone() -> None:

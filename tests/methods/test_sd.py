@@ -80,9 +80,7 @@ def test_what_stays_lies_before_a_plane(b: int, n: int, kept: float, seed: int) 
     for i in range(b):
         stays = (whole[i][:, None] == found[i][None]).all(2).any(1)
         assert stays.sum() == left
-        assert (
-            (found[i][:, None] == whole[i][None]).all(2).any(1).all()
-        )  # and nothing else is there
+        assert (found[i][:, None] == whole[i][None]).all(2).any(1).all()
         height = (whole[i] @ normal[i])[:, 0]
         if left < n:
             assert height[stays].min() >= height[~stays].max() - 1e-6

@@ -16,24 +16,15 @@ def write_encoder(path: Path, dim: int = 6, seed: int = 0, **changes: object) ->
     """max_i relu(x_i W): [B, N, 3] to [B, dim].
 
     `changes`: "scale" of the weights, "axes" of the maximum, "inputs" (further ones), "out" is the
-    output's shape, "external" puts the weights into a file beside it, "some" gives as many features
-    as the clouds say.
+    output's shape.
     """
     value = weights(dim, seed) * np.float32(changes.get("scale", 1.0))
     axes = changes.get("axes", [1])
     nodes = [
         helper.make_node("MatMul", ["points", "w"], ["z"]),
         helper.make_node("Relu", ["z"], ["r"]),
-        helper.make_node("ReduceMax", ["r"], ["m"], axes=axes, keepdims=0),
+        helper.make_node("ReduceMax", ["r"], ["f"], axes=axes, keepdims=0),
     ]
-    if changes.get("some"):
-        nodes += [
-            helper.make_node("ReduceMax", ["z"], ["most"], axes=[0, 1], keepdims=0),
-            helper.make_node("Cast", ["most"], ["which"], to=TensorProto.BOOL),
-            helper.make_node("Compress", ["m", "which"], ["f"], axis=1),
-        ]
-    else:
-        nodes.append(helper.make_node("Identity", ["m"], ["f"]))
     shape = ["b", "n", 3]
     inputs = [helper.make_tensor_value_info("points", TensorProto.FLOAT, shape)]
     for name in changes.get("inputs", ()):  # type: ignore[attr-defined]
@@ -42,11 +33,5 @@ def write_encoder(path: Path, dim: int = 6, seed: int = 0, **changes: object) ->
     graph = helper.make_graph(nodes, "g", inputs, [out], [numpy_helper.from_array(value, "w")])
     opset = [helper.make_opsetid("", 17)]
     model = helper.make_model(graph, opset_imports=opset, ir_version=8)
-    save_model(
-        model,
-        str(path),
-        save_as_external_data=bool(changes.get("external")),
-        location="weights.bin",
-        size_threshold=0,
-    )
+    save_model(model, str(path))
     return path

@@ -75,7 +75,6 @@ class StraightPointNet2(nn.Module):
             nn.ModuleList(StraightMLP(mlp) for mlp in level.mlps) for level in twin.backbone.levels
         )
         self.last, self.head = StraightMLP(twin.backbone.last), twin.head
-        self.balls: list[list[Tensor]] | None = None  # given ones, to compare at equal neighbours
 
     def forward(self, points: Tensor) -> Tensor:
         xyz, features = points, None
@@ -85,8 +84,6 @@ class StraightPointNet2(nn.Module):
                 ball_query_reference(xyz.detach(), centres.detach(), s.radius, s.members)
                 for s in self.scales[i]
             ]
-            if self.balls is not None:
-                balls = self.balls[i]
             parts = [m(xyz, features, centres, ball) for m, ball in zip(mlps, balls, strict=True)]
             xyz, features = centres, torch.cat(parts, dim=2)
         b, m, _ = xyz.shape

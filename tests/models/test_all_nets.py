@@ -1,7 +1,5 @@
 """What every net of conf/model must do; a new file there is tested without another word."""
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +10,8 @@ from omegaconf import OmegaConf
 from torch import nn
 from torch.nn import functional as F
 
-from qs3.config import hydra
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.models.base import PointClassifier, check_points
-from tests.unchecked import unchecked
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
 FROZEN = {"features"}  # a file's net and a head: see test_features
@@ -42,44 +38,6 @@ def clouds(b: int, n: int) -> torch.Tensor:
     return points / points.norm(dim=2).amax(1)[:, None, None]
 
 
-@pytest.mark.parametrize(
-    ("name", "settings", "expected"),
-    [
-        ("dgcnn", {}, 1_800_330),
-        ("dgcnn", {"norm": "domain"}, 1_800_330 + 2 * (64 + 64 + 128 + 256 + 512 + 256)),
-        ("dgcnn", {"variant": "simpleview"}, 1_801_866),
-        ("dgcnn", {"variant": "defrec"}, 2_079_635),
-        ("pointnet", {}, 3_463_763),
-        ("pointnet", {"variant": "basic"}, 680_778),
-        ("pointnet", {"variant": "uda"}, 3_471_827),
-        ("pointnet2", {}, 1_735_146),
-        ("pointnet2", {"variant": "ssg"}, 1_464_650),
-        ("rscnn", {}, 1_281_763),
-        ("rscnn", {"relation": "original"}, 1_281_763),
-        ("simpleview", {}, 800_122),
-    ],
-)
-def test_parameter_count(name: str, settings: dict[str, Any], expected: int) -> None:
-    net = build(name, num_classes=10, **settings)
-    assert sum(p.numel() for p in net.parameters()) == expected
-
-
-@unchecked
-@pytest.mark.parametrize(
-    ("name", "key", "value"),
-    [
-        *(("dgcnn", "k", 0), ("dgcnn", "variant", "x"), ("pointdan", "radius", 0.0)),
-        *(("pointnet", "norm", "layer"), ("rscnn", "relation", "x"), ("simpleview", "views", ())),
-        *(("simpleview", "views", (6,)), ("simpleview", "image_size", 9.5)),
-    ],
-)
-def test_wrong_settings_name_the_key(name: str, key: str, value: Any) -> None:
-    config = OmegaConf.load(CONF / f"{name}.yaml")
-    config.num_classes = 5
-    with pytest.raises(ConfigError, match=key):
-        hydra.build(OmegaConf.merge(config, {key: value}))
-
-
 @each_net
 def test_interface(name: str) -> None:
     net, points = build(name), clouds(3, 70)
@@ -103,52 +61,11 @@ def test_any_number_of_points_and_copies(name: str) -> None:
     assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
 
 
-@each_net
-def test_weights_in_half_precision(name: str) -> None:
-    for kind in (torch.bfloat16, torch.float16):
-        logits = build(name).to(kind)(clouds(2, 40).to(kind))
-        assert logits.dtype == kind
-        assert logits.isfinite().all()
-
-
 @pytest.mark.parametrize("name", sorted(set(NETS) - ORDER_MATTERS))
 def test_order_of_points(name: str) -> None:
     net, points = build(name), clouds(2, 90)
     shuffled = points[:, torch.randperm(90, generator=torch.Generator().manual_seed(1))]
     torch.testing.assert_close(net(shuffled), net(points), rtol=1e-6, atol=1e-8)
-
-
-COMPILED = """
-import copy, sys, torch
-from tests.models.test_all_nets import build, clouds
-net, points = build(sys.argv[1]), clouds(3, 70)
-twin = copy.deepcopy(net)
-twin.compile(backend="eager")
-assert list(twin.state_dict()) == list(net.state_dict())
-torch.testing.assert_close(twin(points), net(points), rtol=1e-9, atol=1e-9)
-outs = []
-for some in (net, twin):
-    torch.manual_seed(0)  # dropout
-    outs.append(some.train()(points))
-    outs[-1].square().sum().backward()
-torch.testing.assert_close(*outs, rtol=1e-9, atol=1e-9)
-for mine, theirs in zip(twin.parameters(), net.parameters(), strict=True):
-    torch.testing.assert_close(mine.grad, theirs.grad, rtol=1e-7, atol=1e-7)
-left_out = sys.argv[1] in ("pointnet2", "rscnn")
-assert (torch._dynamo.utils.counters["stats"]["unique_graphs"] == 0) == left_out
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NETS)
-def test_compiled(name: str) -> None:
-    """As torch's compiler records it: the same numbers, under the same names.
-
-    Without its kernels, which take minutes to make; without jaxtyping, which it cannot follow.
-    """
-    command = [sys.executable, "-W", "ignore", "-c", COMPILED, name]
-    run = subprocess.run(command, cwd=CONF.parents[1], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
 
 
 def test_bad_points() -> None:
@@ -166,8 +83,7 @@ def test_bad_points() -> None:
 def test_autocast(name: str) -> None:
     """bfloat16 moves logits by much less than they differ from cloud to cloud.
 
-    Neighbours and coordinates in bfloat16 would move them by half of that and more. Gradients are
-    finite, float32, and there for each parameter.
+    Neighbours and coordinates in bfloat16 would move them by half of that and more.
     """
     net, points = build(name).float(), clouds(8, 200).float()
     for module in net.modules():
@@ -179,13 +95,10 @@ def test_autocast(name: str) -> None:
     expected = net.eval()(points)
     with torch.autocast("cpu", torch.bfloat16):
         found = net(points)
+        loss = F.cross_entropy(net.train()(points), torch.arange(8) % 5)
     error = (found.float() - expected).square().mean().sqrt()
     assert error < 0.25 * expected.std(0).mean()
-    net.train()
-    with torch.autocast("cpu", torch.bfloat16):
-        loss = F.cross_entropy(net(points), torch.arange(8) % 5)
     loss.backward()
-    for key, parameter in net.named_parameters():
-        assert parameter.grad is not None, key
+    for parameter in net.parameters():
         assert parameter.grad.dtype == torch.float32
-        assert parameter.grad.isfinite().all(), key
+        assert parameter.grad.isfinite().all()

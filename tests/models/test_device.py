@@ -17,7 +17,7 @@ from qs3.models.base import PointClassifier
 from tests.device import Watch, as_on_device, as_on_gpu
 from tests.models.test_all_nets import NETS, build, clouds
 
-# Kernels of a step. The authors' DGCNN has 167. tests/methods/test_every_method.py has those of methods.
+# Kernels of a step. The authors' DGCNN has 167.
 BARS = {
     "dgcnn": 190,
     "pointdan": 350,
@@ -41,16 +41,6 @@ def test_kernels_of_a_step(name: str) -> None:
     watch = _step(net, torch.empty(16, 1024, 3, device="meta"))
     assert watch.carried == []
     assert 100 < watch.kernels.total() <= BARS[name]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("norm", ["instance", "domain"])
-@pytest.mark.parametrize("name", NETS)
-def test_no_norm_asks_for_a_value(name: str, norm: str) -> None:
-    net = build(name, norm=norm).float().to("meta")
-    for training in (True, False):
-        watch = _step(net.train(training), torch.empty(2, 640, 3, device="meta"))
-        assert watch.carried == []
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 import torch
 
 from qs3.datamodules.clouds import Clouds
-from qs3.errors import DataError, MissingDataError
+from qs3.errors import DataError
 from qs3.methods.base import feature_dims
 from qs3.models.features import Encoder, features, remember
 from tests.models.onnx_files import weights, write_encoder
@@ -46,9 +45,6 @@ def test_it_is_the_file_s_net_and_a_head(tmp_path):
     torch.testing.assert_close(net(points), net.head[0](found.global_))
     assert feature_dims(net) == (6, None)
     assert {name.split(".")[0] for name in net.state_dict()} == {"head"}
-    assert sum(p.numel() for p in net.parameters()) == 6 * 4 + 4
-    assert copy.deepcopy(net).backbone.encoder is net.backbone.encoder
-    assert len(made(tmp_path / "a.onnx", hidden=(8, 5)).head) == 9
 
 
 def test_features_are_computed_once_and_kept(tmp_path, clouds, monkeypatch):
@@ -90,31 +86,19 @@ def _bytes(path):
     return path
 
 
-@pytest.mark.parametrize(
-    "write",
-    [
-        _bytes,
-        lambda p: write_encoder(p, external=True),
-        lambda p: write_encoder(p, inputs=["mask"]),
-        lambda p: write_encoder(p, some=True, out=["b", "d"]),
-    ],
-)
+@pytest.mark.parametrize("write", [_bytes, lambda p: write_encoder(p, inputs=["mask"])])
 def test_files_that_are_refused(tmp_path, write):
     path = write(tmp_path / "a.onnx")
     with pytest.raises(DataError, match=r"a\.onnx"):
         made(path)
 
 
-@pytest.mark.parametrize("changes", [{"scale": np.inf}, {"axes": [0], "out": ["n", 6]}])
-def test_features_that_are_refused(tmp_path, changes):
-    net = made(write_encoder(tmp_path / "a.onnx", **changes))
-    with pytest.raises(DataError):
-        net.features(torch.randn(4, 9, 3))
-
-
-def test_another_file_than_was_meant(tmp_path):
+def test_what_would_be_silently_wrong_is_refused(tmp_path):
+    """Another file than was meant, features that are no numbers, a maximum over the clouds."""
     path = write_encoder(tmp_path / "a.onnx")
     with pytest.raises(DataError, match=r"a\.onnx"):
         features(4, str(path), "0" * 64)
-    with pytest.raises(MissingDataError):
-        features(4, str(tmp_path / "no.onnx"), "0" * 64)
+    for changes in ({"scale": np.inf}, {"axes": [0], "out": ["n", 6]}):
+        net = made(write_encoder(path, **changes))
+        with pytest.raises(DataError):
+            net.features(torch.randn(4, 9, 3))

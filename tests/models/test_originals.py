@@ -1,7 +1,8 @@
 """Numbers of the authors' own nets, with weights and clouds by formula (`tests.models.by_formula`).
 
-Made once with their code on the CPU in float64, dropout 0; see docs/reference/backbones.md. Each
-row: the ten logits of the first cloud and the norm of the gradient in all points.
+Made once with their code on the CPU in float64, dropout 0; see docs/reference/backbones.md (of
+PointNet++ yanx27/Pointnet_Pointnet2_pytorch). Each row: the ten logits of the first cloud and the
+norm of the gradient in all points.
 """
 
 from __future__ import annotations
@@ -65,13 +66,31 @@ PUBLISHED = {  # (net, variant, train mode)
         *(0.0897412, -0.0287424, -0.0652085, 0.104782, -0.0526227),
         *(-0.0443204, 0.0979402, -0.0599487, -0.0337435, 0.0960326, 0.0011109),
     ),
+    ("pointnet2", "ssg", True): (
+        *(0.0298412, 0.151493, -0.135183, -0.117643, 0.20685),
+        *(0.00776706, -0.162699, 0.0530215, 0.0558266, 0.00299757, 17401.6),
+    ),
+    ("pointnet2", "ssg", False): (
+        *(-0.0294398, 0.0591844, -0.0735068, -0.0269349, 0.142819),
+        *(-0.0812794, -0.0963575, 0.140346, -0.0127811, -0.0825467, 0.00162204),
+    ),
+    ("pointnet2", "msg", True): (
+        *(0.157728, -0.380308, -0.120848, 0.283043, 0.19502),
+        *(-0.275816, -0.282661, 0.373335, 0.27029, -0.467633, 204814),
+    ),
+    ("pointnet2", "msg", False): (
+        *(-0.0667892, 0.0209309, 0.0932563, -0.123753, -0.00852767),
+        *(0.136262, -0.0898078, -0.043748, 0.0882605, -0.0458262, 0.000371285),
+    ),
 }
 
 
-def _modules(net: PointClassifier) -> list[nn.Module]:
+def _modules(net: PointClassifier, name: str) -> list[nn.Module]:
     """In the order in which data passes them."""
     b = net.backbone
-    if hasattr(b, "edge_convs"):
+    if name == "pointnet2":
+        return [net]
+    if name == "dgcnn":
         parts = [b.transform, b.edge_convs, b.conv5, b.norm5]
     else:
         parts = [b.input_transform, b.first, b.feature_transform, b.middle, b.last]
@@ -80,51 +99,20 @@ def _modules(net: PointClassifier) -> list[nn.Module]:
 
 @pytest.mark.parametrize(("name", "variant", "training"), PUBLISHED)
 def test_logits_and_gradients_are_the_authors(name: str, variant: str, training: bool) -> None:
-    build = {"dgcnn": dgcnn, "pointnet": pointnet}[name]
+    build = {"dgcnn": dgcnn, "pointnet": pointnet, "pointnet2": pointnet2}[name]
     net = build(10, variant=variant, dropout=0.0).double().train(training)
-    fill(_modules(net))
-    points = clouds().requires_grad_()
-    logits = net(points)
-    if (name, variant) == ("pointnet", "simpleview"):
-        logits = logits.log_softmax(1)  # there a part of the net
-    *expected, gradient = PUBLISHED[name, variant, training]
-    *found, found_gradient = figures(logits, points)
-    assert found == pytest.approx(expected, abs=1e-5)
-    assert found_gradient == pytest.approx(gradient, rel=1e-5)
-
-
-POINTNET2 = {  # logits of the first cloud, norm of the gradient in the points
-    ("ssg", True): (
-        *(0.0298412, 0.151493, -0.135183, -0.117643, 0.20685),
-        *(0.00776706, -0.162699, 0.0530215, 0.0558266, 0.00299757, 17401.6),
-    ),
-    ("ssg", False): (
-        *(-0.0294398, 0.0591844, -0.0735068, -0.0269349, 0.142819),
-        *(-0.0812794, -0.0963575, 0.140346, -0.0127811, -0.0825467, 0.00162204),
-    ),
-    ("msg", True): (
-        *(0.157728, -0.380308, -0.120848, 0.283043, 0.19502),
-        *(-0.275816, -0.282661, 0.373335, 0.27029, -0.467633, 204814),
-    ),
-    ("msg", False): (
-        *(-0.0667892, 0.0209309, 0.0932563, -0.123753, -0.00852767),
-        *(0.136262, -0.0898078, -0.043748, 0.0882605, -0.0458262, 0.000371285),
-    ),
-}
-
-
-@pytest.mark.parametrize(("variant", "training"), POINTNET2)
-def test_numbers_of_pointnet2(variant: str, training: bool) -> None:
-    """yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/reference/backbones.md."""
-    net = pointnet2(10, variant, dropout=0.0).double()
-    fill([net])
+    fill(_modules(net, name))
     if variant == "msg":  # there the features come first
         for mlp in net.backbone.levels[1].mlps:
             weight = mlp.linears[0].weight.data
             weight.copy_(torch.cat([weight[:, -3:], weight[:, :-3]], dim=1))
-    points = clouds(4, 700)
-    points = (points / points.norm(dim=2).amax(1)[:, None, None]).requires_grad_()
-    *expected, gradient = POINTNET2[variant, training]
-    *found, found_gradient = figures(net.train(training)(points), points)
+    points = clouds(4, 700 if name == "pointnet2" else 96)
+    if name == "pointnet2":
+        points = points / points.norm(dim=2).amax(1)[:, None, None]
+    logits = net(points.requires_grad_())
+    if (name, variant) == ("pointnet", "simpleview"):
+        logits = logits.log_softmax(1)  # there a part of the net
+    *expected, gradient = PUBLISHED[name, variant, training]
+    *found, found_gradient = figures(logits, points)
     assert found == pytest.approx(expected, abs=1e-5)
     assert found_gradient == pytest.approx(gradient, rel=1e-5)

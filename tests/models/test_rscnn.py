@@ -18,7 +18,6 @@ def _line() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     ("relation", "slots", "expected"),
     [
         ("released", 5, [1, 2, 3, 1, 1]),
-        ("released", 2, [1, 2]),
         ("paper", 4, [1, 2, 3, 1]),
         ("original", 4, [2, 1, 3, 2, 2]),  # the centre, others, filled up with the centre
         ("original", 1, [2, 1]),
@@ -45,10 +44,6 @@ def test_relation_vector(relation: str, s: float) -> None:
     at = members.tolist().index(3)  # 0.1 to the right of the centre
     expected = torch.tensor([0.1, s, 0, 0, 0.1, 0, 0, 1], dtype=torch.float64)
     torch.testing.assert_close(u[at], expected)
-    rows = torch.cat([u[members == m][:1] for m in found[0, 0]])
-    mean, covariance = out.moments()
-    torch.testing.assert_close(mean, rows.mean(0))
-    torch.testing.assert_close(covariance, torch.cov(rows.T, correction=0))
 
 
 @pytest.mark.parametrize(

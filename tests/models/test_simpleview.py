@@ -1,9 +1,7 @@
 import pytest
 import torch
-from torch import nn
 from torch.nn import functional as F
 
-from qs3.models.base import PointClassifier
 from qs3.models.simpleview import depth_images, simpleview
 from tests.models.by_formula import gradient_norm, set_weights, waves
 from tests.models.reference_simpleview import images_reference
@@ -12,15 +10,6 @@ from tests.models.reference_simpleview import images_reference
 def _points(b: int = 3, n: int = 200) -> torch.Tensor:
     x = torch.randn(b, n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return x / x.norm(dim=2).amax(1)[:, None, None]
-
-
-def _small(**settings: object) -> PointClassifier:
-    torch.manual_seed(0)
-    model = simpleview(4, **{"image_size": 16, "channels": 4, "dropout": 0.0} | settings)
-    for p in model.parameters():  # so that every block does something
-        if p.ndim == 1:
-            nn.init.normal_(p, 1.0, 0.3)
-    return model.double()
 
 
 # (0.3, 0.1, -0.2): which pixel by hand, from the table; size 128, so pixel ceil(63.5 + 64 r / d)
@@ -43,14 +32,6 @@ def test_one_point_in_each_view(view: int, row: float, column: float, depth: flo
     assert image[tuple(where)].item() == pytest.approx(depth)
 
 
-def test_shared_pixel() -> None:
-    points = torch.tensor([[[0.0, 0, -0.4], [0, 0, 0.6]]])  # depths 1 and 2 in view 0
-    harmonic = depth_images(points, views=[0])
-    assert harmonic.max().item() == pytest.approx(2 / (1 + 1 / 2))
-    assert depth_images(points, views=[0], pixel="nearest").max().item() == pytest.approx(1)
-    assert (harmonic > 0).sum() == 1
-
-
 def test_projection_equals_reference_with_overflowing_waves() -> None:
     points = 1.5 * _points() + 0.2
     images = depth_images(points, 64).flatten(0, 1)
@@ -65,14 +46,6 @@ def test_up_turns_the_cloud() -> None:
     above = torch.tensor([[[0.0, 0.0, 0.5]]])
     rows = depth_images(above, views=[0, 1, 2, 3], up="z")[0].nonzero()[:, 1]
     assert (rows < 64).all()  # in the upper half of each picture
-
-
-def test_views_are_rows_of_the_table() -> None:
-    points = _points()
-    every = depth_images(points)
-    assert torch.equal(depth_images(points, views=[4, 1]), every[:, [4, 1]])
-    model = _small(views=(4, 1))
-    assert model.features(points).global_.shape == (3, model.backbone.feature_dim) == (3, 64)
 
 
 @pytest.mark.parametrize(
