@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.config.hydra import build
 from qs3.generation.command import generate
-from qs3.sensors.devices.blensor_kinect import DotMask
 from tests.generation.generating import composed
 
 
@@ -23,17 +21,6 @@ def test_b_is_s_but_for_its_name_and_its_sensor():
         for key in ("name", "symbol", "title", "path", "published", "how_to_get", "make"):
             del cfg["domain"][key]
     assert s == b
-
-
-def test_b_looks_through_a_kinect_with_the_camera_of_s():
-    s, b = (build(config(name).recipe).sensor for name in ("specklenet10", "blensor10"))
-    assert isinstance(b, DotMask)
-    keys = ("width_px", "height_px", "focal_px", "baseline_m", "step_px", "min_depth_m")
-    for key in (*keys, "max_depth_m"):
-        assert getattr(b, key) == getattr(s, key)
-    documented = (b.window_px, b.inlier_m, b.fill_px, b.quantiser.steps_per_px, b.column_sigma_px)
-    assert documented == (9, 0.05, 3.1, 8, 0)
-    assert b.min_share == 2 / 3
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """generate.py from a folder of small meshes, with real workers and the real renderer."""
 
-import json
 import os
 import random
 import resource
@@ -68,16 +67,6 @@ def test_force_deletes_nothing_where_the_renderer_cannot_start(finished, meshes,
     with pytest.raises(RenderError):
         generate(config(tmp_path, meshes, "workers=0", "force=true", "renderer.variant=scalar_x"))
     assert fingerprint(folder) == fingerprint(finished[0])
-
-
-def test_a_resume_with_another_version_is_refused(finished, meshes, tmp_path):
-    folder = tmp_path / "specklenet10"
-    folder.mkdir()
-    recipe = json.loads((finished[0] / "recipe.json").read_text())
-    recipe["versions"]["mitsuba"] = "3.8.0"
-    (folder / "recipe.json").write_text(json.dumps(recipe))
-    with pytest.raises(ConfigError, match=r"versions\.mitsuba"):
-        generate(config(tmp_path, meshes, "workers=0"))
 
 
 def test_a_resume_by_other_code_is_refused_and_a_finished_dataset_is_not_asked(
@@ -158,25 +147,6 @@ def test_a_repaired_mesh_is_noticed(meshes, tmp_path):
     with pytest.raises(ConfigError, match="objects"):
         made()
     assert len(made("force=true").ids) == 4
-
-
-def test_what_a_finished_dataset_lacks_is_said_again(meshes, tmp_path, caplog):
-    """A class of which all failed is missing in the line on its data, too."""
-    good = (meshes / "chair/train/chair_0.ply").read_bytes()
-    for cls in ("chair", "lamp"):
-        folder = tmp_path / "meshes" / cls / "train"
-        folder.mkdir(parents=True)
-        for i in range(2):
-            (folder / f"{cls}{i}.ply").write_bytes(good[:200] if cls == "lamp" or i else good)
-    settings = ("workers=0", "classes=[chair,lamp]", "splits=[train]")
-    made = generate(config(tmp_path, tmp_path / "meshes", *settings, domain="modelnet10"))
-    assert len(made.ids) == 1
-    assert "lamp" in made.made_of.without
-    assert "chair" not in made.made_of.without
-    caplog.clear()
-    generate(config(tmp_path, tmp_path / "meshes", *settings, domain="modelnet10"))
-    assert "3 of 4 objects failed" in caplog.text
-    assert "no object of lamp" in caplog.text
 
 
 def test_if_all_fail_nothing_is_left_in_the_way(meshes, tmp_path):

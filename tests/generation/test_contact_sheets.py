@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from qs3.generation.command import generate
-from qs3.generation.kept import clouds_picture, infrared_picture, shown_range
+from qs3.generation.kept import shown_range
 from qs3.store.store import open_pointset
 from tests.generation.generating import config, fingerprint
 
@@ -64,11 +64,3 @@ def test_an_image_is_told_apart_where_the_object_is():
     assert high == pytest.approx(18.8, abs=0.4)
     assert shown_range(values) == pytest.approx(np.percentile(values, [1, 99]))
     assert shown_range(np.array([3.0])) == (3, 3)
-
-
-def test_a_class_without_clouds_and_a_view_without_depth_are_drawn(tmp_path):
-    clouds_picture(tmp_path / "c.png", {"chair": [], "lamp": []}, "none")
-    nothing = np.full((20, 30), np.nan, np.float32)
-    infrared_picture(tmp_path / "i.png", {"chair": ("chair/train/a", {"depth_m": nothing})}, "x")
-    assert picture(tmp_path / "c.png").shape[0] > 100
-    assert picture(tmp_path / "i.png").shape[0] > 100

@@ -2,19 +2,14 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 import qs3
-from qs3.generation.plan import planned
 from qs3.generation.recipes import DepthErrors
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.meshes.mesh import merge
 from qs3.sensors.base import DepthFrame
-from qs3.sensors.devices.time_of_flight import TimeOfFlight
-from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.generation.generating import QUICK, composed
-from tests.sensors.scenery import POSE, box_of, square
+from tests.generation.generating import QUICK
 
 NO_HOLES, NO_MIXED = DepthErrors(holes=False), DepthErrors(mixed_pixels=False)
 NEITHER = DepthErrors(holes=False, mixed_pixels=False)
@@ -64,36 +59,11 @@ def test_without_both_a_mixed_pixel_is_not_filled():
     assert np.isnan(after[8, 19])
 
 
-def test_all_errors_leave_the_frame_alone():
-    frame = step()
-    assert DepthErrors().left_in(frame) is frame
-
-
 def test_coarse_samples_reach_as_many_pixels():
     frame = replace(step(), step_px=4)  # 6 px are one sample
     errors = DepthErrors(mixed_pixels=False)
     assert errors.mixed(frame)[10, 21:24].all()  # wider by more than one sample
     assert not errors.mixed(frame)[10, 20]
-
-
-def test_flying_pixels_of_time_of_flight_are_found_at_its_edges():
-    """That sensor mixes the light of both surfaces: a known place for mixed pixels."""
-    sensor = TimeOfFlight(width_px=120, height_px=90, focal_px=110.0)
-    near, far = square(1.5, 0.61), square(1.9, 2.0)
-    box = box_of(square(1.5, 0.8))
-    frame = sensor.scan(
-        (near, replace(far, label=0)),
-        box,
-        POSE,
-        MitsubaRenderer(samples=4),
-        np.random.default_rng(0),
-    )
-    mixed = replace(NO_MIXED, apart_m=0.06).mixed(frame)  # its noise is 1 cm
-    assert mixed.sum() > 10
-    edge = np.abs(np.diff(frame.clean_m, axis=1, prepend=frame.clean_m[:, :1])) > 0.2
-    edge |= np.abs(np.diff(frame.clean_m, axis=0, prepend=frame.clean_m[:1])) > 0.2
-    close = cv2.dilate(edge.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    assert mixed[close].mean() > 5 * mixed[~close].mean()
 
 
 # --- in a recipe
@@ -112,13 +82,6 @@ def test_what_stays_is_the_same_to_the_bit():
         assert (frame.depth_m != plain.depth_m)[np.isfinite(frame.depth_m)].any() or (
             np.isnan(frame.depth_m) & np.isfinite(plain.depth_m)
         ).any()
-
-
-def test_the_default_adds_no_key():
-    for domain in ("specklenet10", "kinectsim10"):
-        assert "depth_errors" not in planned(composed(f"domain={domain}"))._settings()["recipe"]
-    off = planned(composed("domain=kinectsim10", "depth_errors=neither"))._settings()["recipe"]
-    assert off["depth_errors"]["holes"] is False
 
 
 # --- the table that asks what they are worth

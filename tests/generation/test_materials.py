@@ -13,12 +13,11 @@ import qs3
 from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.generation.materials import Kind, LightAbove, MixedMaterials, parts_of
-from qs3.generation.plan import planned
 from qs3.geometry.cameras import Camera, Intrinsics, look_at
 from qs3.meshes.mesh import Mesh, merge
 from qs3.sensors.renderers.base import Body, Scene
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.generation.generating import QUICK, composed
+from tests.generation.generating import QUICK
 
 LIT = ("materials=mixed", "light=area")
 
@@ -65,11 +64,6 @@ def test_parts_hang_together_by_place_and_not_by_index():
     shuffled = parts_of(Mesh(mesh.vertices, mesh.faces[order]))
     for number in (0, 1):
         assert len(set(shuffled[parts_of(mesh)[order] == number])) == 1
-
-
-def test_one_triangle_and_one_flat_part_are_parts():
-    flat = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
-    np.testing.assert_array_equal(parts_of(flat), [0])
 
 
 # --- materials
@@ -131,18 +125,6 @@ def test_white_under_the_light_has_its_strength(side):
 
 
 # --- whole recipes
-
-
-def test_the_defaults_add_no_key():
-    """So plans, and the hashes of what was made before there were materials, are what they were."""
-    for domain in ("specklenet10", "roomscan10"):
-        cfg = composed(f"domain={domain}")
-        assert "materials" not in cfg
-        assert "light" not in cfg
-        assert not {"materials", "light"} & set(planned(cfg)._settings()["recipe"])
-    lit = planned(composed("domain=kinectsim10", *LIT))._settings()["recipe"]
-    assert lit["light"]["side_m"] == 24.34
-    assert lit["materials"]["kinds"]["metal"]["metal"] is True
 
 
 def test_an_object_s_bytes_depend_on_its_id_and_not_on_the_others():

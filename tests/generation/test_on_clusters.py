@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from qs3.errors import ConfigError, DataError, MeshError, RenderError
+from qs3.errors import DataError, MeshError, RenderError
 from qs3.generation.command import generate
 from qs3.generation.workers import Job, _sent, check_software, save_part, scan_all, software
 from qs3.meshes.folder import MeshFolder
@@ -233,11 +233,3 @@ def test_meshes_travel_without_their_disk(meshes, tmp_path):
     with pytest.raises(MeshError) as there:
         next(item for item in arrived if "broken" in item.id).load()
     assert str(there.value) == str(here.value)  # and not where the copy lay
-
-
-def test_what_cannot_be_sent_is_an_error(tmp_path):
-    (tmp_path / "chair" / "train").mkdir(parents=True)
-    (tmp_path / "chair" / "train" / "a.gltf").touch()
-    for items, keep_views in ((items_of(tmp_path), False), ([], True)):
-        with pytest.raises(ConfigError):
-            _sent(items, keep_views=keep_views)

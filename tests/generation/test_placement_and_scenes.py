@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from qs3.errors import MeshError
 from qs3.generation.command import generate
-from qs3.generation.scenes import Alone, Room
+from qs3.generation.scenes import Room
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import RealSize, UnitCube
 from tests.generation.generating import config
@@ -54,11 +54,6 @@ def test_a_mesh_without_extent_is_refused():
     point = Mesh(np.ones((3, 3)), np.array([[0, 1, 2]]))
     with pytest.raises(MeshError):
         UnitCube().place(point, np.random.default_rng(0))
-
-
-def test_alone_is_the_object_and_nothing_else():
-    (body,) = Alone().bodies(box(), EYES, np.random.default_rng(0))
-    assert body.label == 1
 
 
 @settings(max_examples=60, deadline=None)

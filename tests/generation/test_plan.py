@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 import qs3
-from qs3.generation.command import generate
 from qs3.generation.plan import MAKES_CLOUDS, code_fingerprint, planned, recipe_fingerprint
 from tests.generation.generating import config
 
@@ -87,13 +86,3 @@ def test_all_that_makes_clouds_is_in_it():
     named = set(re.findall(r"_target_: (qs3\.[\w.]+)", text))
     assert len(named) > 20
     assert [name for name in sorted(named) if not name.startswith(COVERED)] == []
-
-
-def test_a_dataset_holds_them(meshes, tmp_path):
-    words = ("workers=0", "force=true")
-    made, again = (
-        generate(config(tmp_path, meshes, *words, *more, domain="modelnet10")).made_of
-        for more in ([], ["scans=2"])
-    )
-    assert again.meshes == made.meshes
-    assert again.recipe != made.recipe

@@ -1,6 +1,5 @@
 """What released=yes does, part by part."""
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +12,6 @@ from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.optics.infrared import FilmicCamera
-from qs3.sensors.optics.visibility import Reason
 from qs3.sensors.renderers.base import Body
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.generation.generating import composed as config
@@ -42,22 +40,6 @@ def test_the_switch_changes_all_and_its_absence_nothing():
     assert isinstance(sensor.infrared, FilmicCamera)
     assert sensor.infrared.faintest == pytest.approx(0.8 * sensor.ambient)
     assert config("released=yes").renderer.samples == 128
-
-
-@pytest.mark.parametrize(
-    "key",
-    [
-        "sensor.matcher.remove_bias=false",
-        "sensor.sample_offset_px=0",
-        "sensor.centre_error_px=0.5",
-        "sensor.blind_left_px=168",
-        "sensor.projector_strength=45.6",
-        "crop.margin_m=0",
-        "recipe.box_of_corners=true",
-    ],
-)
-def test_keys_can_be_given_alone(key):
-    assert build(config(key).recipe) != build(config().recipe)
 
 
 @settings(deadline=None)
@@ -145,24 +127,3 @@ def test_the_grid_error_shifts_the_cloud_by_half_a_pixel(renderer):
     _, col = np.argwhere(np.isfinite(b.clean_m))[0]
     ix = (b.left + col * 4) / 4
     assert (pixel[0, 0] - a.camera.intrinsics.cx_px) / 1500 == pytest.approx((ix - 135) / 375)
-
-
-def test_the_blind_columns_are_those_that_stereobm_leaves_empty(renderer):
-    rng = np.random.default_rng(0)
-    texture = rng.integers(0, 255, (60, 1080), dtype=np.uint8)
-    found = cv2.StereoBM_create(160, 19).compute(np.roll(texture, 40, 1), texture) > 0
-    assert np.flatnonzero(found.any(axis=0))[0] == 168
-
-    # wider than the image, and low
-    bodies, box = square(3.0, POSE, half_m=1.2)
-    mesh = bodies[0].mesh
-    low = Mesh(mesh.vertices * [1, 1, 0.1], mesh.faces)
-    bodies, box = (Body(low),), low.bounds
-    for blind in (0, 168):
-        sensor = SpeckleStereo(sample_offset_px=0, blind_left_px=blind)
-        frame = sensor.scan(bodies, box, POSE, renderer, np.random.default_rng(0))
-        columns = frame.left + 4 * np.flatnonzero(np.isfinite(frame.depth_m).mean(axis=0) > 0.5)
-        # At least the pixels that the right camera sees: 50 px of disparity.
-        assert columns[0] == (168 if blind else pytest.approx(56, abs=12))
-        if blind:
-            assert (frame.reason[:, : (168 - frame.left) // 4] == Reason.OUTSIDE).all()

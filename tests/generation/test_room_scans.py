@@ -17,7 +17,6 @@ from qs3.config.hydra import build
 from qs3.datasets.depth_images import DepthImage, Pinhole
 from qs3.datasets.regions import Limits, Rules
 from qs3.generation.kept import Keep
-from qs3.generation.recipes import TooFewPointsError
 from qs3.generation.room_scans import RoomCamera, one_piece, yaw_between
 from qs3.generation.scenes import Room, Support
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
@@ -130,13 +129,6 @@ def test_a_worktop_is_not_its_cabinet_s(made):
         assert whole.arrays["points_clean"][:, 2].max() == pytest.approx(0.8, abs=1e-3)
 
 
-def test_an_object_that_no_picture_shows_well_says_why(made):
-    far = replace(made.recipe.camera, min_distance_m=30, max_distance_m=31)
-    recipe = replace(made.recipe, camera=far, attempts=2)
-    with pytest.raises(TooFewPointsError):
-        recipe.make(made.mesh, ID, 0, made.renderer)
-
-
 @pytest.fixture(scope="module")
 def lamp(made):
     """A table lamp above the floor, as a recipe places it; its id and its seed."""
@@ -243,44 +235,6 @@ def test_a_scan_of_a_raised_object_is_of_it_alone(cfg, made, lamp):
         ManifestRow(id=lamp.id, cls="lamp", split="train", mesh_sha256=lamp.mesh.sha256)
     )
     np.testing.assert_array_equal(found.vertices, lamp.placed.vertices)
-
-
-def board(height, x):
-    return trimesh.creation.box(
-        (0.04, 0.6, height),
-        transform=[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, height / 2], [0, 0, 0, 1]],
-    )
-
-
-def test_what_a_depth_edge_tears_apart_gives_one_of_its_pieces(made):
-    """A low board 30 cm before a high one, which the rules here join."""
-    both = trimesh.util.concatenate([board(0.5, 0.15), board(0.9, -0.15)])
-    mesh = Mesh(np.asarray(both.vertices), np.asarray(both.faces))
-    near = replace(
-        made.recipe.camera, min_distance_m=1.5, max_distance_m=2.0, spread=0.2, roll_deg=0
-    )
-    whole = replace(
-        made.recipe,
-        camera=near,
-        torn=0.0,
-        scene=Room(wall=0, max_clutter=0, max_occluders=0),
-        rules=replace(made.recipe.rules, join_m=0.5),
-    )
-    joined, alone = [], []
-    for seed in range(6):
-        placed = whole.placing.place(mesh, object_rng(seed, ID, 0), ID).vertices
-        ahead = placed[:8].mean(axis=0)[:2] - placed[8:].mean(axis=0)[:2]
-        middle = placed[:, :2].mean(axis=0)
-        sides = []
-        for recipe in (whole, replace(whole, torn=1.0)):
-            cloud = recipe.make(mesh, ID, seed, made.renderer).arrays["points_clean"]
-            sides.append(float(np.sign((cloud[:, :2] - middle) @ ahead).mean()))
-        if abs(sides[0]) < 0.9:  # both boards are seen: not from behind
-            joined.append(sides[0])
-            alone.append(sides[1])
-    assert len(joined) >= 4
-    assert sum(abs(side) == 1 for side in alone) > len(alone) / 2
-    assert {1.0, -1.0} <= {*alone}
 
 
 def test_a_piece_is_drawn_among_those_that_are_large_enough():

@@ -55,12 +55,6 @@ def _saved(folder):
     return folder / "box.ply"
 
 
-def test_provenance_of_a_scan():
-    scan = qs3.generate(BOX, *WORDS, "provenance=true")
-    assert scan.provenance.shape == (2048, 5)
-    assert set(scan.provenance[:, 0]) == {0, 1}
-
-
 @pytest.mark.parametrize(
     ("solid", "words", "error", "reason"),
     [

