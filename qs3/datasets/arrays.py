@@ -6,7 +6,7 @@ import abc
 import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -99,16 +99,15 @@ class PointDAH5(ArrayFiles):
     Each holds `data` [n, 2048, 6] (x y z in metres with y up, floor at 0; then rgb) and `label`
     [n] in the order of `qs3.classes`. The extraction stored (X, Z, Y) of ScanNet's (X, Y, Z): two
     axes were swapped, so after turning y to z every object is the mirror image of the real one (y
-    is negated). All published numbers were measured on the mirror images; `undo_mirror` gives the
-    real ones.
+    is negated). All published numbers were measured on the mirror images.
     """
 
-    undo_mirror: bool = True
+    form: Literal["real", "mirrored"] = "real"
     ordered: ClassVar[bool] = True
 
     def made_of(self) -> MadeOf:
         """See `Importer`."""
-        if self.undo_mirror:  # published figures were measured on mirror images
+        if self.form == "real":  # published figures were measured on mirror images
             return MadeOf(objects="published files, no longer mirrored")
         return MadeOf(objects="published files", published=True)
 
@@ -124,7 +123,7 @@ class PointDAH5(ArrayFiles):
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
         cloud = turned(cloud, "y")
-        return cloud * _MIRROR if self.undo_mirror else cloud
+        return cloud * _MIRROR if self.form == "real" else cloud
 
 
 @settings

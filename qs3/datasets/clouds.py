@@ -31,43 +31,11 @@ NOTHING = "NaN, infinite or (0, 0, 0)"
 """What stands for no measurement, for messages."""
 
 _XYZ = ["x", "y", "z"]
-_USUAL = frozenset(  # names of columns in comments, which may be about anything
-    [
-        "x",
-        "y",
-        "z",
-        "r",
-        "g",
-        "b",
-        "a",
-        "rgb",
-        "rgba",
-        "red",
-        "green",
-        "blue",
-        "alpha",
-        "i",
-        "intensity",
-        "reflectance",
-        "id",
-        "index",
-        "point",
-        "label",
-        "class",
-        "t",
-        "time",
-        "timestamp",
-        "ring",
-        "nx",
-        "ny",
-        "nz",
-        "normal_x",
-        "normal_y",
-        "normal_z",
-        "curvature",
-        "confidence",
-    ]
-)
+_USUAL = {  # names of columns in comments, which may be about anything
+    *("x", "y", "z", "r", "g", "b", "a", "rgb", "rgba", "red", "green", "blue", "alpha", "i"),
+    *("intensity", "reflectance", "id", "index", "point", "label", "class", "t", "time"),
+    *("timestamp", "ring", "nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "curvature"),
+}
 _DECIMAL_COMMA = re.compile(r"[-+]?(\d+,\d+|\d*\.?\d*)([eE][-+]?\d+)?")
 _ENDS = ",; \t"  # of a row
 _MOST_COLUMNS = 32  # x y z, normals, colours and what else programs write; a picture has more

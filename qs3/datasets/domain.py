@@ -5,7 +5,6 @@ Light on purpose: `train.py` asks `Domain.check` before it imports anything heav
 
 from __future__ import annotations
 
-import itertools
 import logging
 import os
 import shlex
@@ -26,11 +25,6 @@ from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
-Variant = Literal["points", "points_clean", "points_whole"]
-SCALES = ("unit_ball", "metres", "above_floor")
-"""How clouds are as a net sees them: divided by their radius; of their size, about their centroid;
-or of their size, over the floor."""
-
 _GENERATE = ["python", "generate.py"]
 
 
@@ -43,8 +37,7 @@ class Domain:
         symbol: of the paper's tables, e.g. "S".
         title: as in a sentence, e.g. "SpeckleNet10".
         path: folder of the store.
-        variant: which array of the store: "points", "points_clean" for the clean twin, or
-            "points_whole" for the whole surface (generated with twins=[whole]).
+        variant: which array of the store: "points", or "points_clean" for the clean twin.
         twin_of: folder of a store that holds the same objects, and `variant` next to its clouds, if
             that store was generated; what `path` holds itself comes first.
         published: how to read the published files, if there are any: an `Importer`, or its
@@ -56,8 +49,6 @@ class Domain:
             clouds that were normalised) or are not known.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
             where the camera is the origin; None: not known.
-        views: what training sees of a source: "stored", its clouds; "random", each time others of
-            the views and twins that its store keeps (`qs3.datamodules.random_views`).
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
         expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
@@ -70,14 +61,13 @@ class Domain:
     symbol: str
     title: str
     path: Path
-    variant: Variant = "points"
+    variant: Literal["points", "points_clean"] = "points"
     twin_of: Path | None = None
     published: Any = None
     simulated: bool = False
     gravity: Literal["z", "none"] = "z"
     unit: Literal["metres", "none"] = "none"
     floor_m: float | None = None
-    views: Literal["stored", "random"] = "stored"
     how_to_get: str = ""
     make: str | None = None
     stand_in: str | None = None
@@ -86,8 +76,6 @@ class Domain:
     expected_counts: dict[str, list[int]] | None = None
 
     def __post_init__(self) -> None:
-        if self.views == "random" and self.variant != "points":
-            raise ConfigError(f"domain {self.name}: views=random needs variant=points")
         if len(set(self.names)) < max(1, len(self.names)):
             raise ConfigError(f"domain {self.name}: classes are {self.names}: empty or twice")
 
@@ -127,20 +115,15 @@ class Domain:
             log.info(text, self.label, judges, keys)
 
     def check_scale(self, scale: str) -> None:
-        """Find out whether a net can see the clouds at this scale, one of `SCALES`.
-
-        Raises:
-            ConfigError: metres of clouds that are not in metres; heights above an unknown floor.
-        """
+        """Raise ConfigError if a net cannot see the clouds at this scale (`data.scale`)."""
         if scale != "unit_ball" and self.unit != "metres":
             raise ConfigError(
                 f"data.scale={scale}: the clouds of domain {self.name} are not known to be in "
-                "metres; if they are, set data.source.unit=metres or data.target.unit=metres"
+                "metres; if they are, set its unit=metres"
             )
         if scale == "above_floor" and self.floor_m is None:
             raise ConfigError(
-                f"data.scale={scale}: the floor under the clouds of domain {self.name} is not "
-                "known; set data.source.floor_m=Z or data.target.floor_m=Z"
+                f"data.scale={scale}: the floor of domain {self.name} is not known; set its floor_m"
             )
 
     def check(self) -> None:
@@ -198,19 +181,6 @@ class Domain:
             log.warning(text, self.label, ", ".join(problems))
         return replace(dataset, floor_m=self.floor_m)
 
-    def open_array(self, name: str, verify: bool = True) -> PointSet:
-        """The same clouds in another array of the store, such as "points_whole"."""
-        return replace(open_pointset(self.folder, name, verify=verify), floor_m=self.floor_m)
-
-    def has_array(self, name: str) -> bool:
-        """Whether the store has this array of clouds."""
-        return has_variant(self.folder, name)
-
-    def kept_views(self) -> list[str]:
-        """Names of the arrays of single views that the store keeps, in order; often none."""
-        names = (f"points_view{i}" for i in itertools.count())
-        return list(itertools.takewhile(self.has_array, names))
-
     def check_unpublished(self) -> None:
         """Raise DataError if published files are there: a dataset made here would pass for them."""
         importer = self.importer()
@@ -229,15 +199,13 @@ class Domain:
 
     def _other_counts(self, dataset: PointSet) -> list[str]:
         """In which splits and classes there are not as many clouds as were published."""
-        found, problems = dataset.counts(), []
-        for split, counts in (self.expected_counts or {}).items():
-            have = found.get(split, {})
-            problems += [
-                f"{split} {cls} {have.get(cls, 0)} instead of {count}"
-                for cls, count in zip(dataset.classes, counts, strict=True)
-                if have.get(cls, 0) != count
-            ]
-        return problems
+        found = dataset.counts()
+        return [
+            f"{split} {cls} {have} instead of {count}"
+            for split, counts in (self.expected_counts or {}).items()
+            for cls, count in zip(dataset.classes, counts, strict=True)
+            if (have := found.get(split, {}).get(cls, 0)) != count
+        ]
 
     def _refuse_stale(self, importer: Importer) -> None:
         """Raise DataError if the store was imported by other settings, or from other files."""
@@ -257,47 +225,27 @@ class Domain:
             )
 
 
-def check_all(*domains: Domain) -> None:
-    """Check several domains, and list all that are missing at once."""
-    problems = []
-    for domain in {domain.name: domain for domain in domains}.values():
+def check_or_make(source: Domain, target: Domain, make_source: bool) -> None:
+    """Find out, in milliseconds, whether both domains are there.
+
+    With `make_source`, `generate.py` is run for a source that is not there; an interrupted one goes
+    on where it stopped. Raises MissingDataError, which lists all that is missing.
+    """
+    problems = {}
+    for domain in (source, target):
         try:
             domain.check()
         except MissingDataError as error:
-            problems.append(str(error))
-    if problems:
-        raise MissingDataError("\n\n".join(problems))
-
-
-def check_or_make(source: Domain, target: Domain, make_source: bool) -> None:
-    """Find out, in milliseconds, whether both domains are there; make the source if that is asked.
-
-    Raises MissingDataError, which lists all that is missing, or as `make_if_missing`.
-    """
-    if make_source:
-        target.check()  # before minutes are spent on the source
-        make_if_missing(source)
-    check_all(source, target)
-
-
-def make_if_missing(domain: Domain) -> None:
-    """Run `generate.py` for a domain whose data are not there; it shows its progress.
-
-    An interrupted one goes on where it stopped when it is called again.
-    """
-    try:
-        domain.check()
-        return
-    except MissingDataError:
-        words = shlex.split(domain.make or "")
-        if words[:2] != _GENERATE:
-            raise
-    if int(os.environ.get("LOCAL_RANK", 0)) > 0:
-        return  # the first process makes it
-    log.info("%s is not there and is made: %s", domain.label, typed(shlex.join(words)))
-    done = subprocess.run([*python_command("generate"), *words[2:]], check=False)
-    if done.returncode:
-        raise Qs3Error(f"domain {domain.name} could not be made (exit status {done.returncode})")
+            problems[domain.name] = error
+    words = shlex.split(source.make or "")
+    if make_source and [*problems] == [source.name] and words[:2] == _GENERATE:
+        if int(os.environ.get("LOCAL_RANK", 0)) == 0:  # the first process makes it
+            log.info("%s is not there and is made: %s", source.label, typed(shlex.join(words)))
+            done = subprocess.run([*python_command("generate"), *words[2:]], check=False)
+            if done.returncode:
+                raise Qs3Error(f"domain {source.name} could not be made ({done.returncode})")
+    elif problems:
+        raise MissingDataError("\n\n".join(map(str, problems.values())))
 
 
 def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:

@@ -116,17 +116,10 @@ def provide(
     """Bring the folders of a source to where their importers look; what is there stays.
 
     Nothing is fetched if all its folders are in place. An interruption at any moment leaves no
-    half folder: the same call again starts over.
-
-    For the arguments see `qs3.commands.download`.
+    half folder: the same call again starts over. For the arguments see `qs3.commands.download`.
 
     Returns:
         The folders, in the order of `source.parts`, also those that somebody else had put there.
-
-    Raises:
-        AgreementError: `source.agreement` was not accepted.
-        DataError: the archive is damaged, or holds something else.
-        DownloadError, Qs3Error: network, disk.
     """
     if source.agreement and accept_terms != source.agreement:
         text, where = _FILE["agreements"][source.agreement], f" into={into}"

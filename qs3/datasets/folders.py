@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import itertools
 import logging
 import re
 from collections import Counter
@@ -23,7 +22,6 @@ from qs3.datasets.clouds import (
     SUFFIXES,
     CloudFile,
     checked,
-    npy_clouds,
     parse_cloud,
     parse_clouds,
     with_depth,
@@ -55,8 +53,7 @@ _SCANNET = re.compile(r"/(scene\d{4})_\d{2}(?:_|$)")
 _SPLIT_NAMES = ("train", "test", "val", "validation")
 _SPLIT_PREFIX = re.compile(rf"({'|'.join(_SPLIT_NAMES)})(?![a-z])", re.IGNORECASE)  # train_0.h5
 _CLOUDS = (".xyz", ".npy")  # of published trees
-_MANY = (".npy", ".npz", ".h5", ".hdf5")
-_MESH_TREES = ("", "raw", "ModelNet40", "ModelNet10")  # below the folder, the tree may lie here
+_MANY = (".npy", ".npz", ".h5", ".hdf5")  # may hold several clouds
 
 
 @settings
@@ -113,37 +110,44 @@ class GraspNetPC(Importer):
 
     1024 rows of x y z, in the frame of the camera, already in the unit ball; there is no gravity
     axis. The classes are the objects 0, 2, 5, 8, 9, 15, 46, 48, 60, 66 of GraspNet, called 0 to 9.
-    The test split is one scene an object, so its frames are highly correlated.
+    The test split is one scene an object, so its frames are highly correlated; the synthetic part
+    has none.
 
     Attributes:
-        sensors: whose clouds; the benchmark's synthetic domain takes both.
+        part: "synthetic", rendered for both sensors; or the real frames of one.
     """
 
     points: Annotated[int, Ge(1)] = 1024
-    reality: Literal["Real", "Synthetic"] = "Real"
-    sensors: list[Literal["kinect", "realsense"]] = field(
-        default_factory=lambda: ["kinect", "realsense"]
-    )
+    part: Literal["synthetic", "kinect", "realsense"] = "synthetic"
 
     def looks_for(self) -> str:
         """See `Importer`."""
-        sensors = ",".join(self.sensors)
-        return f"{self.root}/{{train,test}}/{self.reality}/{{{sensors}}}/<0-9>/*.xyz"
+        return f"{self.root}/{{train,test}}/{{Real,Synthetic}}/{{kinect,realsense}}/<0-9>/*.xyz"
 
     def is_there(self) -> bool:
-        """See `Importer`: whether the training part of a sensor is there."""
-        return any((self.root / "train" / self.reality / s).is_dir() for s in self.sensors)
+        """See `Importer`: whether a training part is there."""
+        return any(folder.is_dir() for _, _, folder in self._folders() if "train" in folder.parts)
 
     def items(self, classes: Sequence[str]) -> list[Item]:
-        """See `Importer`. By split, class, sensor and name; the synthetic domain has no test."""
+        """See `Importer`. By split, class, sensor and name."""
         found = []
-        for split, sensor in itertools.product(("train", "test"), self.sensors):
-            for folder in folders_in(self.root / split / self.reality / sensor):
+        for split, sensor, of_sensor in self._folders():
+            for folder in folders_in(of_sensor):
                 cls = class_of(folder.name, classes, folder)
                 for path in files_in(folder, (".xyz",)):
                     name = f"{sensor}_{path.stem}"
                     found.append(file_item(path, self.root, cls, split, parse_cloud, name))
         return by_class(found, classes)
+
+    def _folders(self) -> list[tuple[str, str, Path]]:
+        """Split, sensor and folder of each."""
+        sensors = ("kinect", "realsense") if self.part == "synthetic" else (self.part,)
+        reality = "Synthetic" if self.part == "synthetic" else "Real"
+        return [
+            (split, sensor, self.root / split / reality / sensor)
+            for split in ("train", "test")
+            for sensor in sensors
+        ]
 
     def object_of(self, id_: str) -> str:
         """See `Importer`: each class is one object."""
@@ -178,11 +182,11 @@ class ModelNetMeshes(Importer):
 
     def is_there(self) -> bool:
         """See `Importer`: whether there is a folder with a folder `train`."""
-        return self._tree() is not None
+        return any((folder / "train").is_dir() for folder in folders_in(self._tree))
 
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`. By split, in it by class, in it by name."""
-        tree = self._tree() or self.root
+        tree = self._tree
 
         def named(folder: str) -> str | None:
             # A name that is wanted as it is comes before its meaning among the ten: `night_stand`
@@ -198,11 +202,9 @@ class ModelNetMeshes(Importer):
             found.append(item._replace(row=dataclasses.replace(item.row, seed=seed)))
         return by_class(unique(found), classes)
 
-    def _tree(self) -> Path | None:
-        for below in _MESH_TREES:
-            if any((folder / "train").is_dir() for folder in folders_in(self.root / below)):
-                return self.root / below
-        return None
+    @property
+    def _tree(self) -> Path:
+        return self.root / "raw" if (self.root / "raw").is_dir() else self.root
 
 
 @settings
@@ -220,8 +222,7 @@ class CloudFolder(Importer):
     names. Such a file may have its split before its name, train_0.h5, where no folder is one.
 
     A cloud with more than P points is thinned to its P farthest; one with fewer repeats its points.
-    Points without depth are left out before (`with_depth`). The manifest's `valid_points` says how
-    many there were of the others.
+    Points without depth are left out before (`with_depth`).
 
     Attributes:
         layout: one of those above; "auto" looks at the names of the folders.
@@ -255,11 +256,7 @@ class CloudFolder(Importer):
         read = functools.lru_cache(maxsize=1)(parse_clouds)  # one file in memory at a time
         found: list[Item] = []
         for path in _files(self.root):
-            cls, split = self._place(path, layout, classes)
-            stem = path.stem
-            if layout == "none":  # any depth; elsewhere the folders are class or split
-                stem = path.relative_to(self.root).with_suffix("").as_posix()
-            found += self._of_file(path, cls, split, stem, classes, read)
+            found += self._of_file(path, *self._place(path, layout, classes), layout, classes, read)
         found = unique(found)
         if self.test_every and layout == "class":
             found = _with_tests(found, self.test_every)
@@ -306,38 +303,37 @@ class CloudFolder(Importer):
         path: Path,
         cls: str,
         split: str,
-        stem: str,
+        layout: str,
         classes: Sequence[str],
         read: Callable[[Path], CloudFile],
     ) -> list[Item]:
         """The clouds of a file; of those that may hold several only number and labels are kept."""
-        origin = path.relative_to(self.root).as_posix()
-        number, many, labels = 1, False, None
-        try:
-            if path.suffix.lower() == ".npy":
-                count = npy_clouds(path)
-                number, many = count or 1, count is not None
-            elif path.suffix.lower() in _MANY:
+        origin, below = path.relative_to(self.root).as_posix(), path.relative_to(self.root)
+        file, wrong = CloudFile((np.empty(0),)), None
+        if path.suffix.lower() in _MANY:
+            try:
                 file = read(path)
-                number, many, labels = len(file.clouds), file.many, file.labels
-        except DataError as error:
-            split = split or "train"
-            row = ManifestRow(cloud_id(cls, split, stem), cls, split, origin=origin)
-            return [Item(row, str(path), functools.partial(_raise, error))]
+            except DataError as error:
+                wrong = error
         if not split:
-            prefix = _SPLIT_PREFIX.match(path.stem) if many else None
+            prefix = _SPLIT_PREFIX.match(path.stem) if file.many else None
             split = split_of(prefix[1].lower(), path) if prefix else "train"
         found = []
-        for i in range(number):
-            where = f"{path}, cloud {i}" if many else str(path)
+        for i in range(len(file.clouds)):
+            where = f"{path}, cloud {i}" if file.many else str(path)
             load: Callable[[], np.ndarray] = functools.partial(_cloud, read, path, i, where)
             own = cls
             try:
-                own = cls or (_label(labels[i], classes, where) if labels else "")
+                if wrong is not None:
+                    raise wrong
+                if file.labels and not cls:
+                    own = _label(file.labels[i], classes, where)
             except DataError as error:
                 load = functools.partial(_raise, error)
-            name = (path.stem if own else stem) + (f"_{i:04d}" if many else "")
-            place = f"{origin}[{i}]" if many else origin
+            # Folders are class or split, unless there are neither.
+            name = below.with_suffix("").as_posix() if layout == "none" and not own else path.stem
+            name += f"_{i:04d}" if file.many else ""
+            place = f"{origin}[{i}]" if file.many else origin
             row = ManifestRow(cloud_id(own, split, name), own, split, origin=place)
             found.append(Item(row, where, load))
         return found
@@ -391,14 +387,12 @@ def _with_tests(items: Iterable[Item], every: int) -> list[Item]:
 
 
 def _label(label: Any, classes: Sequence[str], where: str) -> str:
-    """The class that a file's own label means."""
+    """The class that a file's own label means: a name, or a number from 0."""
     if isinstance(label, bytes):
         label = label.decode(errors="replace")
-    if isinstance(label, str):
-        return class_of(label, classes, where)
-    if not isinstance(label, int) or not 0 <= label < len(classes):
-        raise DataError(f"{where}: label {label!r} is not 0..{len(classes) - 1}")
-    return classes[label]
+    if isinstance(label, int) and 0 <= label < len(classes):
+        return classes[label]
+    return class_of(str(label), classes, where)
 
 
 def _is_split(name: str) -> bool:

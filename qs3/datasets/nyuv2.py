@@ -10,10 +10,6 @@ reverse order:
     instances     uint8 [N, W, H]    counts the things of one name within a frame from 1
     names         cells of text      by the numbers of `labels`
     scenes        cells of text      the room of each frame, e.g. kitchen_0004
-    accelData     float32 [4, N]     readings of the accelerometer, then the tilt
-
-The page calls the columns of `accelData` roll, yaw, pitch and tilt; Kinect's driver gives the
-acceleration along three axes. `vertical.mounting` finds out whether the first three give up.
 
 The raw depth lies in the colour camera's image, so its intrinsics are the colour camera's, from
 camera_params.m of the authors' toolbox (there with pixels counted from 1). Depth is projected to
@@ -29,10 +25,10 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,11 +37,11 @@ from jaxtyping import Bool, Float, Int
 from qs3.datasets.cutting import cut
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
 from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, load_mat
-from qs3.datasets.vertical import Mounting, angle_deg, floor_up, mounting, planes_up
+from qs3.datasets.vertical import floor_up, planes_up
 from qs3.errors import DataError
 from qs3.store.meta import MadeOf
 from qs3.utils.files import reading
-from qs3.utils.progress import progress_bar
+from qs3.utils.progress import shown
 from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
@@ -56,11 +52,8 @@ CAMERA = Pinhole(518.857901, 519.469611, 325.582449 - 1, 253.736166 - 1)
 AREA = (44, 471, 40, 601)
 """Rows from, to and columns from, to of the depth that was projected; of pictures of 640 x 480."""
 
-Vertical = Literal["floor", "accelerometer", "planes"]
 _SIZE = (480, 640)
 _FARTHEST_M = 9.99
-_MOST_MOUNTING_DEG = 5.0  # readings that agree worse with the floors are not used
-_MOST_APART_DEG = 10.0  # a floor farther off its reading is none: a rug on stairs, a mirror
 
 
 class LabelledFrames:
@@ -70,7 +63,6 @@ class LabelledFrames:
         path: of the file.
         names: by number of label; names[0] is the first name, whose number is 1.
         scenes: the room of each frame; empty strings if the file does not have them.
-        accelerations: [N, 3] float64 readings; NaN where there are none.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,12 +74,9 @@ class LabelledFrames:
             self._file: Any = h5py.File(path, "r")
             self._n, *self._shape = self._file["rawDepths"].shape
             self.names, self.scenes = self._words("names"), [""] * self._n
-            self.accelerations = np.full((self._n, 3), np.nan)
             if "scenes" in self._file:
                 self.scenes = self._words("scenes")
-            if "accelData" in self._file:
-                self.accelerations = np.asarray(self._file["accelData"][:3].T, dtype=np.float64)
-            assert len(self.scenes) == len(self.accelerations) == self._n
+            assert len(self.scenes) == self._n
 
     def __enter__(self) -> LabelledFrames:
         return self
@@ -150,16 +139,12 @@ class NYUv2(FrameDataset):
 
     Attributes:
         file, splits: names of nyu_depth_v2_labeled.mat and splits.mat in the folder.
-        vertical: how up is found, the first way that gives one; see `qs3.datasets.vertical`.
         with_contents: name -> names of things that belong to it where they lie within its outline.
-        camera: intrinsics in place of the published ones.
     """
 
     file: str = "nyu_depth_v2_labeled.mat"
     splits: str = "splits.mat"
-    vertical: list[Vertical] = field(default_factory=lambda: ["floor", "accelerometer", "planes"])
     with_contents: dict[str, list[str]] = field(default_factory=dict)
-    camera: Pinhole | None = None
 
     def files(self) -> Sequence[Path]:
         """See `FrameDataset`."""
@@ -174,23 +159,21 @@ class NYUv2(FrameDataset):
 
         Frames without a vertical are left out, and so are those of neither split.
         """
+        found, lost = [], []
         with LabelledFrames(self.root / self.file) as frames:
             splits = read_splits(self.root / self.splits, len(frames))
-            ups = self._verticals(frames, splits)
-            if lost := [i + 1 for i, found in ups.items() if found is None]:
-                log.warning("%s: frames without a vertical are left out: %s", frames.path, lost)
-            return [
-                FrameTask(
-                    i + 1,
-                    splits[i],
-                    _room(frames.scenes[i]) or f"block{i // self.block:04d}",
-                    "kinect_v1",
-                    found[0],
-                    upright(found[1]).tolist(),
-                )
-                for i, found in ups.items()
-                if found is not None
-            ]
+            chosen = [i for i, split in enumerate(splits) if split]
+            for i in shown(chosen, "looking for floors"):
+                way, up = _vertical(frames, i)
+                room = _room(frames.scenes[i]) or f"block{i // self.block:04d}"
+                if up is None:
+                    lost.append(i + 1)
+                    continue
+                turn = upright(up).tolist()
+                found.append(FrameTask(i + 1, splits[i], room, "kinect_v1", way, turn))
+        if lost:
+            log.warning("%s: frames without a vertical are left out: %s", self.root, lost)
+        return found
 
     def cutter(self) -> Cutter:
         """See `FrameDataset`."""
@@ -199,7 +182,7 @@ class NYUv2(FrameDataset):
         def cut_frame(task: FrameTask) -> list[Cut]:
             index = task.number - 1
             turn = np.array(task.world_from_camera)
-            image = DepthImage(frames.depth_m(index), self.camera or CAMERA, turn, frames.area)
+            image = DepthImage(frames.depth_m(index), CAMERA, turn, frames.area)
             labels, instances = frames.labels(index), frames.instances(index)
             cuts = []
             for number in np.unique(labels[labels > 0]).tolist():
@@ -233,66 +216,17 @@ class NYUv2(FrameDataset):
         cv2.fillConvexPoly(inside, hull, (1,))
         return others & (inside == 1)
 
-    def _verticals(
-        self, frames: LabelledFrames, splits: Sequence[str]
-    ) -> dict[int, tuple[str, np.ndarray] | None]:
-        """How the vertical of each frame of a split was found, and up in its camera."""
-        chosen = [i for i, split in enumerate(splits) if split]
-        floors: dict[int, np.ndarray] = {}
-        if {*self.vertical} & {"floor", "accelerometer"}:  # whose mounting the floors give
-            floors = self._floors(frames, chosen)
-        seat = _checked_mounting(frames, floors) if "accelerometer" in self.vertical else None
-        found: dict[int, tuple[str, np.ndarray] | None] = {}
-        for i in chosen:
-            ways = ((way, self._up(way, frames, i, floors, seat)) for way in self.vertical)
-            found[i] = next(((way, up) for way, up in ways if up is not None), None)
-        return found
 
-    def _floors(self, frames: LabelledFrames, chosen: Sequence[int]) -> dict[int, np.ndarray]:
-        if "floor" not in frames.names:
-            return {}
-        number, found = frames.names.index("floor") + 1, {}
-        with progress_bar("looking for floors", total=len(chosen)) as advance:
-            for i in chosen:
-                floor = frames.labels(i) == number
-                camera = self.camera or CAMERA
-                up = floor_up(frames.depth_m(i), camera, floor) if floor.any() else None
-                if up is not None:
-                    found[i] = up
-                advance()
-        return found
-
-    def _up(
-        self,
-        way: str,
-        frames: LabelledFrames,
-        frame: int,
-        floors: Mapping[int, np.ndarray],
-        seat: Mounting | None,
-    ) -> np.ndarray | None:
-        """Up by one way; None if it does not give it."""
-        reading = seat.up(frames.accelerations[frame]) if seat else None
-        if way == "accelerometer":
-            return reading
-        if way == "planes":
-            return planes_up(frames.depth_m(frame), self.camera or CAMERA)
-        up = floors.get(frame)
-        apart = up is not None and reading is not None and angle_deg(up, reading)
-        return None if apart and apart > _MOST_APART_DEG else up
+def _vertical(frames: LabelledFrames, frame: int) -> tuple[str, np.ndarray | None]:
+    """How the vertical of a frame was found, and up in its camera; see `qs3.datasets.vertical`."""
+    depth_m, floor = frames.depth_m(frame), np.zeros(0, bool)
+    if "floor" in frames.names:
+        floor = frames.labels(frame) == frames.names.index("floor") + 1
+    if floor.any() and (up := floor_up(depth_m, CAMERA, floor)) is not None:
+        return "floor", up
+    return "planes", planes_up(depth_m, CAMERA)
 
 
 def _room(scene: str) -> str:
     """The room in a scene's name: bookstore_0001d is a recording of bookstore_0001."""
     return re.sub(r"(?<=\d)[a-z]$", "", re.sub(r"[^\w-]", "-", scene))
-
-
-def _checked_mounting(frames: LabelledFrames, floors: Mapping[int, np.ndarray]) -> Mounting | None:
-    """How the accelerometer sits in the camera, if its readings agree with the floors."""
-    if not floors:
-        return None
-    seat = mounting(frames.accelerations[list(floors)], np.stack(list(floors.values())))
-    if seat is None or seat.error_deg > _MOST_MOUNTING_DEG:
-        log.warning("%s: accelerometer readings do not agree with the floors", frames.path)
-        return None
-    log.info("%s: accelerometer and floors agree within %.1f°", frames.path, seat.error_deg)
-    return seat

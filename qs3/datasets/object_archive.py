@@ -35,9 +35,10 @@ from jaxtyping import Float
 
 from qs3.datasets.clouds import read_arrays
 from qs3.datasets.importing import Importer, Item, by_class, class_of
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError
 from qs3.store.manifest import ManifestRow
 from qs3.store.meta import MadeOf
+from qs3.utils.files import reading
 from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
@@ -171,7 +172,7 @@ class ObjectArchive(Importer):
                 left[str(archive.tier[i] if split else archive.dev[i])] += 1
                 continue
             frame = int(archive.frame[i])
-            name = f"{cluster(frame, self.block)}_{frame:05d}_{i}"
+            name = f"block{frame // self.block:04d}_{frame:05d}_{i}"
             more = {"frame": str(frame), "sub": str(archive.sub[i]), "tier": str(archive.tier[i])}
             origin = f"{self.path.name}[{i}]"
             row = ManifestRow(f"{cls}/{split}/{name}", cls, split, None, "", origin, 1, more=more)
@@ -214,25 +215,19 @@ class ObjectArchive(Importer):
         return np.select([~ours, test, near], ["", "test", ""], "train").tolist()
 
 
-def cluster(frame: int, block: int) -> str:
-    """The block of frames that a frame is of."""
-    return f"block{frame // block:04d}"
-
-
 def read_archive(path: Path) -> Archive:
     """Read and check the file; nothing in it is unpickled."""
     found = read_arrays(path, _REQUIRED, _OPTIONAL)
     n, p, start = len(found["cls"]), len(found["xyz_tenth_mm"]), found["start"].astype(np.int64)
     lengths = {"xyz_tenth_mm": p, "inlier": p, "start": n + 1}
-    odd = [key for key, array in found.items() if len(array) != lengths.get(key, n)]
-    if not n or start[0] != 0 or start[-1] != p or (np.diff(start) < 1).any():
-        odd.append("start")
-    if not np.isfinite(found["centre_m"]).all():
-        odd.append("centre_m")
-    if not {*found["tier"].tolist()} <= {*TIERS}:
-        odd.append("tier")
-    if odd:
-        raise DataError(f"{path}: arrays {odd} do not describe {n} objects of {p} points")
+    with reading(path):
+        odd = [key for key, array in found.items() if len(array) != lengths.get(key, n)]
+        assert not odd, f"arrays {odd} do not describe {n} objects of {p} points"
+        assert start[0] == 0, "start does not begin at 0"
+        assert start[-1] == p, "start does not end at the number of points"
+        assert (np.diff(start) >= 1).all(), "start does not ascend"
+        assert np.isfinite(found["centre_m"]).all(), "centre_m is not finite"
+        assert {*found["tier"].tolist()} <= {*TIERS}, "tier is not clean or hard"
     return Archive(
         path,
         found["cls"],
@@ -252,20 +247,14 @@ def read_archive(path: Path) -> Archive:
 
 def _contents(path: Path) -> str:
     """What an .npz holds, by the checksums of its members; nothing is unpacked."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = [f"{m.filename} {m.file_size} {m.CRC}\n" for m in archive.infolist()]
-    except zipfile.BadZipFile:
-        return "damaged"
+    with reading(path), zipfile.ZipFile(path) as archive:
+        members = [f"{m.filename} {m.file_size} {m.CRC}\n" for m in archive.infolist()]
     return hashlib.sha256("".join(members).encode()).hexdigest()
 
 
 def is_archive(path: Path) -> bool:
     """Whether a file is an .npz of objects cut from depth images."""
-    if path.suffix.lower() != ".npz":
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
         return False
-    try:
-        with zipfile.ZipFile(path) as file:
-            return "xyz_tenth_mm.npy" in file.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
+    with reading(path), zipfile.ZipFile(path) as file:
+        return "xyz_tenth_mm.npy" in file.namelist()

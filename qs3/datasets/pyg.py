@@ -134,7 +134,6 @@ def from_pyg(
 
 def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str | int | None]:
     """Points [n, 3] float32, label and id of one cloud."""
-    pos: Any = item.pos
     y, key = getattr(item, "y", None), getattr(item, "id", None)
     if getattr(item, "face", None) is not None:
         raise DataError(f"{where} is a mesh: give the dataset transform=SamplePoints(n)")
@@ -143,8 +142,7 @@ def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str | int | No
         raise DataError(f"{where}: y is {y}, expected one whole number, the class")
     # A collated dataset has a number as a tensor.
     name: Any = key.item() if isinstance(key, Tensor | np.ndarray | np.generic) else key
-    points: np.ndarray = pos.detach().cpu().numpy().astype(np.float32)
-    return points, label, None if name == "" else name
+    return item.pos.detach().cpu().numpy().astype(np.float32), label, None if name == "" else name
 
 
 def _classes(
@@ -152,14 +150,12 @@ def _classes(
 ) -> list[str]:
     known = [label for label in labels if label is not None]
     names = given if given is not None else getattr(dataset, "classes", None)
-    if names is None and known:
-        raise ConfigError(f"give classes=: {max(known) + 1} names or more, in the order of y")
-    names = list(class_list(names))
-    if len(set(names)) < len(names) or (known and not 0 <= min(known) <= max(known) < len(names)):
+    found = [] if names is None and known else list(class_list(names))
+    if len(set(found)) < len(found) or (known and not 0 <= min(known) <= max(known) < len(found)):
         raise ConfigError(
-            f"labels are {min(known, default=0)} to {max(known, default=0)}, classes {names}"
+            f"classes={found}: expected a name for each y, {min(known)} to {max(known)}"
         )
-    return names
+    return found
 
 
 def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) -> Tensor:

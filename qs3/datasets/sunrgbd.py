@@ -24,8 +24,6 @@ column of the manifest is 0.
 
 from __future__ import annotations
 
-import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -42,8 +40,6 @@ from qs3.store.meta import MadeOf
 from qs3.utils.files import reading
 from qs3.utils.settings import settings
 
-log = logging.getLogger(__name__)
-
 META = "SUNRGBDMeta3DBB_v2.mat"
 SPLITS = "SUNRGBDtoolbox/traintestSUNRGBD/allsplit.mat"
 Sensor = Literal["kv1", "kv2", "xtion", "realsense"]
@@ -51,20 +47,8 @@ SENSORS: tuple[Sensor, ...] = get_args(Sensor)
 
 _ROOT = "SUNRGBD"
 _SUN3D = "sun3ddata"  # its folders are rooms; those of the other parts are single frames
-_NAMED = 12  # other names that the log shows
 _SWAPPED = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """(x, y, z) of the camera to the toolbox's (x, z, -y)."""
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledBox:
-    """One box of a frame: the authors' word for it, and the box in the frame with z up.
-
-    The box is None if its numbers are not those of a box: people drew thousands.
-    """
-
-    name: str
-    box: Box | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +61,8 @@ class Frame:
         folder: of the frame, relative to the archive, e.g. "SUNRGBD/kv2/align_kv2/2014...".
         camera: of the depth image.
         world_from_camera: [3, 3] rotation to z up.
-        boxes: things in it.
+        boxes: the authors' words for the things in it, and their boxes in the frame with z up; None
+            where the numbers are not those of a box: people drew thousands.
     """
 
     number: int
@@ -85,7 +70,7 @@ class Frame:
     folder: PurePosixPath
     camera: Pinhole
     world_from_camera: Float[np.ndarray, "3 3"]
-    boxes: tuple[LabelledBox, ...]
+    boxes: tuple[tuple[str, Box | None], ...]
 
 
 def read_frames(root: Path) -> list[Frame]:
@@ -144,16 +129,10 @@ class SUNRGBD(FrameDataset):
     def tasks(self) -> list[FrameTask]:
         """See `FrameDataset`; frames of the chosen sensors that are of a split."""
         splits = read_splits(self.root, self.splits)
-        frames = [one for one in read_frames(self.root) if one.sensor in self.sensors]
-        known = [one for one in frames if one.folder in splits]
-        log.info("%s: frames in neither split: %d", self.root, len(frames) - len(known))
-        others = Counter(b.name for one in known for b in one.boxes if b.name not in self.names)
-        log.info("boxes of other names are left out: %s", others.most_common(_NAMED))
         return [
-            FrameTask(
-                one.number, splits[one.folder], _cluster(one, self.block), one.sensor, "published"
-            )
-            for one in known
+            FrameTask(one.number, split, _cluster(one, self.block), one.sensor, "published")
+            for one in read_frames(self.root)
+            if one.sensor in self.sensors and (split := splits.get(one.folder))
         ]
 
     def cutter(self) -> Cutter:
@@ -162,21 +141,20 @@ class SUNRGBD(FrameDataset):
 
         def cut_frame(task: FrameTask) -> list[Cut]:
             frame = frames[task.number]
-            wanted = [box for box in frame.boxes if box.name in self.names]
+            wanted = [(name, box) for name, box in frame.boxes if name in self.names]
             if not wanted:
                 return []
             image = open_image(self.root, frame)
             cuts = []
-            for number, one in enumerate(wanted, start=1):
-                if one.box is None:
+            for number, (name, box) in enumerate(wanted, start=1):
+                if box is None:
                     nothing = np.zeros((0, 3), np.float32)
                     why = "its numbers are not those of a box"
                     piece = Piece(nothing, np.zeros(0, bool), 0, 1.0, why=why, refused=True)
                 else:
-                    mask = box_mask(image, one.box, self.rules)
-                    piece = cut(image, mask, self.names[one.name], self.rules, edge_px=0)
-                origin = f"{frame.folder}, {one.name} {number}"
-                cuts.append(self.cut_of(one.name, origin, piece))
+                    mask = box_mask(image, box, self.rules)
+                    piece = cut(image, mask, self.names[name], self.rules, edge_px=0)
+                cuts.append(self.cut_of(name, f"{frame.folder}, {name} {number}", piece))
             return cuts
 
         return cut_frame
@@ -210,7 +188,7 @@ def _frame(entry: dict[str, Any], number: int) -> Frame:
     )
 
 
-def _box(entry: dict[str, Any]) -> LabelledBox:
+def _box(entry: dict[str, Any]) -> tuple[str, Box | None]:
     """One of thousands that people drew: one that is not a box costs only itself."""
     name = str(entry.get("classname", ""))
     try:
@@ -218,11 +196,9 @@ def _box(entry: dict[str, Any]) -> LabelledBox:
         half = np.abs(np.asarray(entry["coeffs"], np.float64)).reshape(3)
         centre = np.asarray(entry["centroid"], np.float64).reshape(3)
     except (KeyError, TypeError, ValueError):
-        return LabelledBox(name, None)
-    whole = np.isfinite([*axes.ravel(), *half, *centre]).all()
-    if not whole or not np.allclose(axes @ axes.T, np.eye(3), atol=0.05):
-        return LabelledBox(name, None)
-    return LabelledBox(name, Box(centre, axes, half))
+        return name, None
+    good = np.allclose(axes @ axes.T, np.eye(3), atol=0.05) and np.isfinite([half, centre]).all()
+    return name, Box(centre, axes, half) if good else None
 
 
 def _inner(words: Any) -> PurePosixPath:

@@ -1,19 +1,13 @@
-"""Which way is up in a frame, in camera coordinates: three ways, the most reliable first.
+"""Which way is up in a frame, in camera coordinates: two ways, the more reliable first.
 
 Floor: the plane of the pixels that are labelled so. 1/z of a plane's pixels is linear in their
 rays, and a triangulating sensor's noise is even in it, so that is what is fitted.
-
-Accelerometer: its readings say where up is in the sensor's own axes, whose order and signs no file
-states. They are found from the frames that have a floor: the orthogonal matrix that takes readings
-to floors best (Schönemann 1966). If readings and floors do not agree, the readings are not used.
 
 Planes: the direction to which most surfaces are parallel or perpendicular, from up in the picture
 on (Gupta, Arbeláez, Malik, CVPR 2013, whose published rotations of NYU Depth V2 were found so).
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -28,7 +22,6 @@ LEAST_FLOOR_PX = 1500
 _ROUNDS = 6  # of fit and trimming
 _TRIM = 3.0  # median absolute deviations
 _LEAST_SHARE = 0.5  # of the floor's pixels that must lie in the plane
-_LEAST_FRAMES = 10  # with readings and a floor, for the mounting
 _MOST_OF_EIGHT = 5
 _STEP_PX, _REACH_PX = 4, 8  # every how many pixels a normal, and from how far
 _FOCAL_PX = 525.0  # of the cameras for which that is so; smaller pictures have smaller windows
@@ -58,49 +51,6 @@ def floor_up(
         return None
     up: np.ndarray = -plane / length  # the camera is above its floor
     return up if angle_deg(up, CAMERA_UP) <= MOST_TILT_DEG else None
-
-
-@dataclass(frozen=True, eq=False)
-class Mounting:
-    """How an accelerometer sits in its camera.
-
-    Attributes:
-        camera_from_sensor: [3, 3] orthogonal; may hold a reflection.
-        error_deg: median angle between readings and floors.
-        frames: that it was found from.
-    """
-
-    camera_from_sensor: Float[np.ndarray, "3 3"]
-    error_deg: float
-    frames: int
-
-    def up(self, reading: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"] | None:
-        """Unit vector up by one reading; None if it has no direction."""
-        length = float(np.linalg.norm(reading))
-        if not np.isfinite(length) or length < 1e-6:
-            return None
-        found: np.ndarray = self.camera_from_sensor @ (np.asarray(reading, np.float64) / length)
-        return found
-
-
-def mounting(readings: Float[np.ndarray, "n 3"], ups: Float[np.ndarray, "n 3"]) -> Mounting | None:
-    """From frames with a reading and a floor; None if there are too few.
-
-    Frames whose floor and reading disagree (somebody moved the camera) are left out after a first
-    fit.
-    """
-    length = np.linalg.norm(readings, axis=1)
-    good = np.isfinite(readings).all(axis=1) & np.isfinite(length) & (length > 1e-6)
-    if good.sum() < _LEAST_FRAMES:
-        return None
-    sensor, camera = readings[good] / length[good, None], ups[good]
-    kept = np.ones(len(sensor), dtype=bool)
-    for _ in range(3):
-        u, _, v = np.linalg.svd(camera[kept].T @ sensor[kept])
-        turn = u @ v
-        off = np.degrees(np.arccos(np.clip(((sensor @ turn.T) * camera).sum(axis=1), -1, 1)))
-        kept = off <= max(2.0, 2 * float(np.median(off)))
-    return Mounting(turn, float(np.median(off)), len(sensor))
 
 
 def planes_up(depth_m: Float[np.ndarray, "h w"], camera: Pinhole) -> Float[np.ndarray, " 3"] | None:

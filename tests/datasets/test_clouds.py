@@ -102,17 +102,6 @@ def test_pcd_of_every_encoding(tmp_path: Path, encoding: Encoding) -> None:
         read_pcd(tmp_path / "b.pcd")
 
 
-def test_ply_keeps_the_order_and_the_digits_of_its_vertices(tmp_path: Path) -> None:
-    """Faces neither merge nor drop vertices; double coordinates stay double."""
-    rows = ["0.1 0 0", "1 0 0", "0.1 0 0", "0 1.123456789 0", "5 5 5"]
-    head = "ply\nformat ascii 1.0\nelement vertex 5\n"
-    head += "".join(f"property double {axis}\n" for axis in "xyz")
-    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    (tmp_path / "a.ply").write_text(head + "\n".join([*rows, "3 0 1 3"]) + "\n")
-    expected = [[float(word) for word in row.split()] for row in rows]
-    np.testing.assert_array_equal(parse_cloud(tmp_path / "a.ply"), expected)
-
-
 @pytest.mark.parametrize(
     "shape",
     [(480, 640), (60, 33), (9, 480, 640), (3, 11), (6, 2048), (5, 3, 64), (240, 320, 3), (4,)],
@@ -137,19 +126,6 @@ def test_few_points_and_many_columns_are_clouds(shape: tuple, tmp_path: Path) ->
     found = parse_clouds(tmp_path / "a.npy").clouds
     np.testing.assert_array_equal(np.stack(found), array.reshape(-1, *shape[-2:])[..., :3])
     assert npy_clouds(tmp_path / "a.npy") == (7 if len(shape) == 3 else None)
-
-
-@pytest.mark.parametrize("names", ["xyz", "XYZ"])
-def test_records_go_by_the_names_of_their_fields(tmp_path: Path, names: str) -> None:
-    fields = [("rgb", "u4"), *((name, "f4") for name in reversed(names)), ("ring", "u2")]
-    records = np.zeros(len(CLOUD), dtype=fields)
-    for axis, name in enumerate(names):
-        records[name] = CLOUD[:, axis]
-    np.save(tmp_path / "a.npy", records)
-    np.testing.assert_array_equal(parse_cloud(tmp_path / "a.npy"), CLOUD)
-    np.save(tmp_path / "b.npy", np.zeros(4, [("rgb", "u4"), *((name, "f4") for name in names[:2])]))
-    with pytest.raises(DataError, match=r"b\.npy"):
-        parse_cloud(tmp_path / "b.npy")
 
 
 def test_files_of_several_clouds_and_their_labels(tmp_path: Path) -> None:

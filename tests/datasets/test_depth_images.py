@@ -47,17 +47,6 @@ def test_the_unit_of_depth_is_that_of_its_numbers(tmp_path):
     np.testing.assert_allclose(read_depth(tum, 1 / 5000), DEPTH, atol=1e-4)
 
 
-def test_the_highest_number_of_16_bits_is_no_depth(tmp_path):
-    """65.5 m far: cameras that have no 0 write it where nothing was measured."""
-    full = np.array([[900, 65535], [65534, 0]])
-    for kind in ("<u2", ">u2"):
-        found = read_depth(npy(tmp_path / "u.npy", full.astype(kind)), 1e-4)
-        assert found.tolist() == [[pytest.approx(0.09), 0.0], [pytest.approx(6.5534), 0.0]]
-    found = read_depth(png(tmp_path / "u.png", full.astype(np.uint16)), 1e-4)
-    assert found[0, 1] == 0
-    assert read_depth(npy(tmp_path / "i.npy", full.astype(np.int32)), 1e-4)[0, 1] > 6
-
-
 def test_a_camera_s_scale_of_depth_is_not_passed_over(tmp_path):
     """BOP's YCB-V: a tenth of a millimetre a unit; 0.8 m were read as 8 m."""
     tenths = png(tmp_path / "a.png", np.full((480, 640), 8000, np.uint16))
@@ -201,15 +190,6 @@ def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, name, content,
     scale = 1.0 if "depth_scale" in text else None
     assert found == Intrinsics(Pinhole(525, 526, 319.5, 239.5), size, bent, scale)
     assert read_intrinsics("525,526,319.5,239.5").camera == found.camera
-
-
-def test_intrinsics_of_numpy(tmp_path):
-    for array in (MATRIX, [525, 526, 319.5, 239.5], np.pad(MATRIX, (0, 1)) + np.diag([0, 0, 0, 1])):
-        path = npy(tmp_path / "K.npy", np.array(array))
-        assert read_intrinsics(str(path)) == Intrinsics(Pinhole(525, 526, 319.5, 239.5))
-    for wrong in (np.ones((3, 4)), np.array(["a"] * 4)):
-        with pytest.raises(DataError):
-            read_intrinsics(str(npy(tmp_path / "K.npy", wrong)))
 
 
 @pytest.mark.parametrize(

@@ -130,15 +130,6 @@ def test_a_broken_download_is_no_file_and_a_known_hash_is_checked(site, tmp_path
         get(site, "specklenet40", tmp_path)  # is not there
 
 
-def test_what_lies_there_is_left_alone(site, tmp_path, caplog):
-    mine = tmp_path / "published" / "specklenet10" / "chair"
-    mine.mkdir(parents=True)
-    get(site, "specklenet10", tmp_path)
-    assert "is left alone" in caplog.text
-    assert site.requests == []
-    assert mine.is_dir()
-
-
 def test_scannet_needs_an_agreement(site, tmp_path, speckle):
     (site.folder / "depthscannet10.zip").write_bytes(speckle)
     for word in ("", "yes"):
@@ -214,10 +205,3 @@ def test_the_command(site, tmp_path, speckle, monkeypatch, capsys):
     for name in (*SOURCES, *BY_HAND):
         assert name in text
         assert name in SOURCES or main(["download", name]) == 1
-
-
-def test_addresses_of_modelnet_are_those_of_pyg():
-    from torch_geometric.datasets import ModelNet
-
-    for name in ("10", "40"):
-        assert SOURCES[f"modelnet{name}_off"].address == ModelNet.urls[name]

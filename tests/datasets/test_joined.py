@@ -61,16 +61,6 @@ def test_all_clouds_are_there_and_scans_of_an_object_are_called_so(tmp_path):
     assert not data.made_of.published
 
 
-def test_a_small_cloud_keeps_the_number_of_its_points(tmp_path):
-    write(tmp_path / "a", ["bed/train/1"])
-    first = joined(tmp_path, "a").open()
-    assert first.points.shape == (1, 48, 3)
-    importer = Joined(tmp_path, points=64, datasets=["joined"])
-    again = Domain("k", "K", "K", tmp_path / "k", published=importer, classes=list(CLASSES)).open()
-    assert read_manifest(tmp_path / "k", CLASSES)[0].valid_points == 32
-    np.testing.assert_array_equal(again.points[0][32:], again.points[0][:32])
-
-
 def test_no_object_trains_and_validates(tmp_path):
     ids = [f"{cls}/train/{i}" for cls in CLASSES for i in range(20)]
     write(tmp_path / "a", ids)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from qs3.classes import CLASSES
-from qs3.datasets.folders import ModelNetMeshes, sample_file
-from qs3.errors import DataError
+from qs3.datasets.folders import ModelNetMeshes
 from qs3.meshes.io import load_mesh
 from tests.fixtures.modelnet import OTHERS, TEN, off_text, write_off_tree
 
@@ -37,18 +36,6 @@ def test_order_names_and_seeds(modelnet):
     assert len({row.seed for row in rows}) == 30
     assert {row.valid_points for row in rows} == {64}
     assert all(cloud.shape == (64, 3) and cloud.dtype == np.float32 for cloud in clouds.values())
-
-
-def test_the_tree_is_found_where_others_keep_it(modelnet, tmp_path):
-    expected, _ = read(modelnet, points=8)
-    for below in ("raw", "ModelNet40", ""):
-        (tmp_path / "x").mkdir()
-        (tmp_path / "x" / below).parent.mkdir(exist_ok=True)
-        write_off_tree(tmp_path / "x" / below, SPLITS)
-        found, _ = read(tmp_path / "x", points=8)
-        assert all(np.array_equal(found[key], expected[key]) for key in expected)
-        (tmp_path / "x").rename(tmp_path / f"done{below}")
-    assert not ModelNetMeshes(tmp_path / "nowhere").is_there()
 
 
 def test_pygs_dataset_opens_the_same_files_and_reads_the_same_meshes(modelnet):
@@ -95,57 +82,5 @@ def test_a_cloud_depends_on_its_own_seed_only(modelnet, tmp_path):
     assert all(np.array_equal(first[key], fewer[key]) for key in fewer)
 
 
-@pytest.mark.skipif(not ARRAYS.is_file(), reason="../shared/data is not there")
-def test_counts_of_the_official_split(tmp_path):
-    """Names and split of PointDA-10's list, put into ModelNet40's folders; no file is opened."""
-    with np.load(ARRAYS) as arrays:
-        names = list(zip(arrays["name"].tolist(), arrays["split"].tolist(), strict=True))
-    for name, split in names:
-        folder = tmp_path / name.rpartition("_")[0] / split
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.off").touch()
-    for other in ("airplane", "dresser", "wardrobe"):
-        (tmp_path / other / "train").mkdir(parents=True)
-        (tmp_path / other / "train" / f"{other}_0001.off").touch()
-    rows = [item.row for item in ModelNetMeshes(tmp_path).items(CLASSES)]
-    assert sum(row.split == "train" for row in rows) == 4183
-    assert sum(row.split == "test" for row in rows) == 856
-    train = [sum(r.cls == c and r.split == "train" for r in rows) for c in CLASSES]
-    test = [sum(r.cls == c and r.split == "test" for r in rows) for c in CLASSES]
-    assert train == [106, 515, 572, 200, 889, 124, 465, 240, 680, 392]
-    assert test == [50, 100, 100, 86, 100, 20, 100, 100, 100, 100]
-    assert {(Path(row.origin).stem, row.split) for row in rows} == set(names)
-
-
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 1.5, 0]])
 GOOD = off_text(SQUARE, [[0, 1, 2], [0, 2, 3]])
-
-
-@pytest.mark.parametrize(
-    ("text", "message", "pyg"),
-    [
-        # what PyG's reader makes of it: the number of faces, or its exception
-        (off_text(SQUARE, [[0, 1, 2, 3, 4], [0, 1, 2]]), None, 1),
-        (GOOD.replace("OFF\n5 2 0", "OFF5 2 0"), None, 2),
-        ("\n".join(GOOD.splitlines()[:-1]) + "\n", "truncated", 1),
-        (GOOD.replace("3 0 2 3", "3 0 2 9"), "vertex 9, but there are 5", 2),
-        (GOOD.replace("0.500000", "nan"), "not finite", 2),
-        (off_text(np.zeros((3, 3)), [[0, 1, 2]]), "zero area", 1),
-        ("", "is empty", IndexError),
-    ],
-)
-def test_readers_on_odd_and_damaged_files(tmp_path, text, message, pyg):
-    from torch_geometric.io import read_off
-
-    path = tmp_path / "chair_0001.off"
-    path.write_text(text)
-    if isinstance(pyg, int):
-        assert read_off(str(path)).face.reshape(3, -1).shape[1] == pyg
-    else:
-        with pytest.raises(pyg):
-            read_off(str(path))
-    if message is None:
-        assert np.isfinite(sample_file(path, 16, 0)).all()
-    else:
-        with pytest.raises(DataError):
-            sample_file(path, 16, 0)

@@ -2,16 +2,14 @@
 
 import shutil
 
-import h5py
 import numpy as np
 import pytest
-from scipy.io import savemat
 
 from qs3.datasets import nyuv2 as reader
 from qs3.errors import ConfigError, Qs3Error
 from qs3.store.store import is_finished, read_manifest
 from tests.composing import compose_domain
-from tests.fixtures.frame_files import NAMES, Shot, Thing, write_nyuv2
+from tests.fixtures.frame_files import write_nyuv2
 
 EXPECTED = {  # frame, name: class and tier; what is not here is refused or of no class
     (1, "chair"): ("chair", "clean"),
@@ -73,14 +71,6 @@ def test_without_noise_every_point_is_exact(tmp_path, shots):
         assert off.max() < 1e-3, row.id
 
 
-def test_books_belong_to_their_shelf(opened, shots):
-    _, data, rows = opened
-    cloud = data.points[next(row.index for row in rows if row.cls == "bookshelf")]
-    (books,) = [thing for thing in shots[5].things if thing.name == "books"]
-    near = books.distance(shots[5].to_world(np.asarray(cloud, dtype=float))) < 0.03
-    assert 0.05 < near.mean() < 0.6
-
-
 def test_rooms_are_clusters_and_the_vertical_is_told(opened):
     domain, _, rows = opened
     importer = domain.importer()
@@ -91,20 +81,6 @@ def test_rooms_are_clusters_and_the_vertical_is_told(opened):
     ways = {int(row.more["frame"]): row.more["vertical"] for row in rows}
     assert {ways[frame] for frame in range(1, 7)} == {"floor"}
     assert ways[7] == "planes"  # no floor, and too few floors to trust the accelerometer
-
-
-@pytest.mark.slow
-def test_the_same_again_and_only_clean(opened, nyuv2, tmp_path):
-    _, data, _ = opened
-    keys = {"paths.data_dir": str(nyuv2), "path": str(tmp_path / "again")}
-    assert compose_domain("nyuv2", keys).open().sha256 == data.sha256
-    assert not (tmp_path / ".again.parts").exists()
-    keys = {**keys, "path": str(tmp_path / "clean"), "published.tiers": "[clean]"}
-    clean = compose_domain("nyuv2", keys)
-    assert len(clean.open()) == len([t for _, t in EXPECTED.values() if t == "clean"]) + 1
-    told = [r.reason for r in read_manifest(clean.folder, clean.names) if r.status != "ok"]
-    assert any(reason.startswith("hard (") for reason in told)
-    assert clean.open().made_of.objects.startswith("real objects")
 
 
 def test_an_interrupted_import_goes_on(opened, nyuv2, tmp_path, monkeypatch):
@@ -152,40 +128,6 @@ def test_other_settings_begin_anew(nyuv2, tmp_path, monkeypatch, caplog):
     assert len(data) == 8
 
 
-@pytest.mark.slow
-def test_other_processes_cut_the_same(opened, nyuv2, tmp_path):
-    keys = {"paths.data_dir": str(nyuv2), "path": str(tmp_path / "two"), "published.workers": "1"}
-    assert compose_domain("nyuv2", keys).open().sha256 == opened[1].sha256
-
-
-def test_accelerometer_where_enough_floors_agree(tmp_path, monkeypatch):
-    """Ten frames with a floor tell how the sensor sits; the eleventh has none."""
-    rng = np.random.default_rng(3)
-    size = (240, 320)
-    camera = (259.4, 259.7, 162.0, 126.0)
-    shots = [
-        Shot(
-            [Thing("cabinet", 0, 2.4, 30)], pitch_deg=rng.uniform(5, 30),
-            roll_deg=rng.uniform(-6, 6), size=size, camera=camera, floor=i < 11,
-        )
-        for i in range(12)
-    ]  # fmt: skip
-    write_nyuv2(tmp_path / "published" / "nyuv2", shots)
-    keys = {
-        "paths.data_dir": str(tmp_path),
-        "published.camera": "{fx_px: 259.4, fy_px: 259.7, cx_px: 162.0, cy_px: 126.0}",
-        "published.rules.limits.cabinet.pixels": "500",
-    }
-    tasks = compose_domain("nyuv2", keys).importer().tasks()
-    assert [task.vertical for task in tasks] == ["floor"] * 11 + ["accelerometer"]
-    up = np.array(tasks[11].world_from_camera)[2]
-    assert np.degrees(np.arccos(up @ shots[11].up_in_camera)) < 0.5
-    monkeypatch.setattr("qs3.datasets.nyuv2.planes_up", lambda *_: None)
-    keys["published.vertical"] = "[planes,floor,accelerometer]"  # the next ways, if the first fails
-    after = compose_domain("nyuv2", keys).importer().tasks()
-    assert [task.vertical for task in after] == [task.vertical for task in tasks]
-
-
 @pytest.fixture
 def copy(nyuv2, tmp_path):
     shutil.copytree(nyuv2 / "published", tmp_path / "published")
@@ -199,31 +141,11 @@ def refused(root):
     assert not is_finished(root / "nyuv2")
 
 
-def test_labels_without_a_name_and_wrong_splits(copy):
-    folder = copy / "published" / "nyuv2"
-    for splits in (
-        {"trainNdxs": [[1], [2]], "testNdxs": [[2]]},
-        {"trainNdxs": [[1], [99]], "testNdxs": [[2]]},
-        {"trainNdxs": [[1]]},
-    ):
-        whole = (folder / "splits.mat").read_bytes()
-        savemat(folder / "splits.mat", splits)
-        refused(copy)
-        (folder / "splits.mat").write_bytes(whole)
-    with h5py.File(folder / "nyu_depth_v2_labeled.mat", "a") as file:
-        labels = file["labels"][...]
-        labels[2, 200, 200] = len(NAMES) + 5
-        file["labels"][...] = labels
-    refused(copy)
-
-
 @pytest.mark.parametrize(
     "override",
     [
         {"published.names": "{chair: throne}"},
-        {"published.vertical": "[gut]"},
         {"published.tiers": "[good]"},
-        {"published.camera": "{fx_px: 0, fy_px: 1, cx_px: 0, cy_px: 0}"},
         {"published.rules.erode_px": "-1"},
     ],
 )

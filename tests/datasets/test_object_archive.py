@@ -1,6 +1,5 @@
 """An archive of cut objects: parts, folds, stray points; and the real one, where it is at hand."""
 
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from qs3.datamodules.domain import DomainData
 from qs3.datasets.domain import compose_domain
-from qs3.datasets.object_archive import read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.store.store import is_finished, read_manifest
 from tests.fixtures.frame_files import write_archive
@@ -57,15 +55,6 @@ def test_points_classes_and_parts(file, tmp_path):
     kept.open()
     sizes = {row.valid_points for row in read_manifest(kept.folder, data.classes)}
     assert sizes <= set(arrays["pixels"].tolist())
-
-
-def test_clean_alone_and_other_parts(file, tmp_path):
-    path, arrays = file
-    clean = domain(path, tmp_path / "a", tiers="[clean]").open()
-    judged = np.isin(arrays["dev"], ["adapt", "judge"])
-    assert len(clean) == int(((arrays["tier"] == "clean") & judged).sum())
-    gap = domain(path, tmp_path / "b", test_parts="[gap]", train_parts="[]").open()
-    assert (len(gap), set(gap.splits)) == (2, {"test"})
 
 
 def test_parts_that_there_are_not_are_named(file, tmp_path):
@@ -146,18 +135,3 @@ def test_arrays_that_do_not_fit_together(tmp_path, key, value):
     with pytest.raises(DataError, match=r"x\.npz"):
         domain(tmp_path / "x.npz", tmp_path).open()
     assert not is_finished(tmp_path / "objects")
-
-
-@pytest.mark.skipif(not FOUND, reason="shared/data/nyuv2_objects is not at hand")
-def test_the_real_archive_has_the_counts_that_are_published():
-    archive = read_archive(FOUND[0])
-    assert len(archive) == 1474
-    assert Counter(archive.tier.tolist()) == {"clean": 530, "hard": 944}
-    assert Counter(archive.dev.tolist()) == {"adapt": 1060, "judge": 334, "gap": 80}
-    counts = Counter(archive.cls.tolist())
-    assert (counts["bathtub"], counts["bookshelf"]) == (9, 21)
-    assert counts.most_common(1)[0][0] == "chair"
-    assert counts["chair"] == 491
-    cloud = archive.cloud(0, inliers_only=False)
-    assert 700 <= len(cloud) <= 2048
-    assert np.isfinite(cloud).all()

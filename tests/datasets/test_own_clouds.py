@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 
@@ -10,11 +9,11 @@ import h5py
 import numpy as np
 import pytest
 
-from qs3.datasets.folders import CloudFolder, PublishedTree
-from qs3.datasets.importing import Importer, import_into
+from qs3.datasets.folders import CloudFolder
+from qs3.datasets.importing import import_into
 from qs3.errors import DataError
 from qs3.store.store import open_pointset, read_manifest
-from tests.datasets.own_clouds import CLOUD, FORMATS, TWO, own, write
+from tests.datasets.own_clouds import CLOUD, TWO, own, write
 
 
 def test_layouts_are_recognised(tmp_path: Path) -> None:
@@ -27,19 +26,6 @@ def test_layouts_are_recognised(tmp_path: Path) -> None:
     for root in ("one", "two"):
         _, rows = CloudFolder(tmp_path / root, points=4).read(TWO, tmp_path)
         assert [row.id for row in rows] == expected
-
-
-def test_every_fifth_of_a_class_tests(tmp_path: Path) -> None:
-    for i in range(7):
-        write(tmp_path / "Chair" / f"c{i}.xyz", CLOUD + i)
-        write(tmp_path / "bed" / f"b{i}.ply", CLOUD + i)
-    clouds, rows = CloudFolder(tmp_path, points=4).read(TWO, tmp_path)
-    assert [r.id for r in rows if r.split == "test"] == ["bed/test/b4", "chair/test/c4"]
-    assert len(rows) == 14
-    place = [row.id for row in rows].index("chair/test/c4")
-    np.testing.assert_array_equal(clouds[place], (CLOUD + 4).astype("f4"))
-    _, rows = CloudFolder(tmp_path, points=4, test_every=0).read(TWO, tmp_path)
-    assert {row.split for row in rows} == {"train"}
 
 
 def test_without_labels(tmp_path: Path) -> None:
@@ -116,21 +102,6 @@ def test_wrong_folders_and_names(tmp_path: Path) -> None:
     assert not CloudFolder(tmp_path / "e").is_there()
 
 
-def test_linked_folders_are_not_followed(tmp_path: Path) -> None:
-    """A link to a folder above would give every cloud some forty times."""
-    write(tmp_path / "a.xyz")
-    (tmp_path / "again").symlink_to(tmp_path)
-    assert len(CloudFolder(tmp_path, points=4, layout="none").items(TWO)) == 1
-
-
-def test_clouds_with_and_without_labels_are_not_one_dataset(tmp_path: Path) -> None:
-    write(tmp_path / "in" / "train" / "bed" / "a.xyz")
-    write(tmp_path / "in" / "train" / "b.xyz")
-    with pytest.raises(DataError):
-        own(tmp_path, layout="split/class").open()
-    assert not (tmp_path / "store").exists()
-
-
 def test_files_of_several_clouds(tmp_path: Path) -> None:
     many = np.stack([CLOUD, CLOUD + 1])
     with h5py.File(tmp_path / "train_0.h5", "w") as file:
@@ -166,26 +137,6 @@ def test_damage_can_be_skipped_and_is_recorded(tmp_path: Path, suffix: str) -> N
     own(tmp_path, on_error="skip").open()
 
 
-def test_a_store_without_damage_may_be_used_where_damage_is_left_out(tmp_path: Path) -> None:
-    write(tmp_path / "in" / "bed" / "a.xyz")
-    own(tmp_path, test_every=0).open()
-    own(tmp_path, test_every=0, on_error="skip").open()
-    with pytest.raises(DataError, match="up"):
-        own(tmp_path, test_every=0, up="x", on_error="skip").open()
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_points_that_are_not_finite_are_left_out(tmp_path: Path, suffix: str) -> None:
-    cloud = np.random.default_rng(0).standard_normal((12, 3)).astype(np.float32)
-    left = np.delete(cloud, [0, 5], axis=0)
-    cloud[0], cloud[5, 1] = np.nan, np.inf
-    write(tmp_path / "bed" / f"a{suffix}", cloud)
-    importer = CloudFolder(tmp_path, points=10, test_every=0)
-    (read,), (row,) = importer.read(("bed",), tmp_path)
-    np.testing.assert_array_equal(read, left)
-    assert row.valid_points == 10
-
-
 def test_changed_files_are_noticed(tmp_path: Path) -> None:
     for name in ("bed/a.xyz", "bed/b.npy", "chair/a.npz"):
         write(tmp_path / "in" / name)
@@ -209,18 +160,6 @@ def test_changed_files_are_noticed(tmp_path: Path) -> None:
     assert domain.open().sha256 == before
 
 
-def test_a_class_that_is_called_as_a_split_is_not_taken_for_one(tmp_path: Path) -> None:
-    several = np.stack([CLOUD + i for i in range(5)])
-    for cls in ("test", "bed"):
-        (tmp_path / "in" / cls).mkdir(parents=True)
-        np.save(tmp_path / "in" / cls / "a.npy", several)
-    domain = dataclasses.replace(own(tmp_path), classes=["test", "bed"])
-    ids = domain.open().ids
-    assert "test/test/a_0004" in ids
-    assert "test/train/a_0000" in ids
-    assert domain.open().ids == ids
-
-
 def test_files_that_change_during_the_import(tmp_path: Path) -> None:
     """Half of a folder that is still being copied must not become a store."""
 
@@ -233,24 +172,3 @@ def test_files_that_change_during_the_import(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         import_into(tmp_path / "s", Slow(tmp_path / "in", points=4), name="s", classes=TWO)
     assert not (tmp_path / "s").exists()
-
-
-@pytest.mark.parametrize("importer", [CloudFolder, PublishedTree])
-def test_names_equal_but_for_case(tmp_path: Path, importer: type[Importer]) -> None:
-    """Elsewhere one of them would overwrite the other."""
-    write(tmp_path / "bed" / "train" / "a.xyz")
-    write(tmp_path / "bed" / "train" / "A.XYZ")
-    with pytest.raises(DataError):
-        importer(tmp_path, points=4).items(("bed",))
-
-
-def test_ids_of_splits_without_labels(tmp_path: Path) -> None:
-    for name in ("train/a.xyz", "train/b.npy", "test/a.xyz"):
-        write(tmp_path / name)
-    np.save(tmp_path / "test" / "m.npy", np.stack([CLOUD, CLOUD]))
-    _, rows = CloudFolder(tmp_path, points=4).read(TWO, tmp_path)
-    ids = ["train/a", "train/b", "test/a", "test/m_0000", "test/m_0001"]
-    assert [row.id for row in rows] == ids
-    _, rows = CloudFolder(tmp_path, points=4, layout="none").read(TWO, tmp_path)
-    ids = ["test/a", "test/m_0000", "test/m_0001", "train/a", "train/b"]
-    assert [row.id for row in rows] == [f"train/{id_}" for id_ in ids]

@@ -117,14 +117,6 @@ def test_two_things_with_one_number_are_cautioned_and_two_parts_of_one_are_not()
     assert one.cautions == ()
 
 
-def test_an_object_without_depth_says_so_and_the_others_go_on():
-    depth, mask = seen()
-    depth[mask == 1] = 0
-    none, some = point_out(depth, CAMERA, mask=mask, up=ROOM.up_in_camera)
-    assert none.why == f"none of its {(mask == 1).sum()} pixels has depth"
-    assert some.why == ""
-
-
 @pytest.mark.parametrize("off_deg", [0.0, 15.0, 30.0, 60.0])
 def test_an_up_that_the_planes_contradict_is_cautioned(off_deg):
     """Beyond 20 degrees, with what they say; the up that is given is used nevertheless."""

@@ -1,23 +1,18 @@
 """Datasets of ours in PyTorch Geometric's hands, and theirs in ours."""
 
 import pickle
-import re
-import shlex
 
 import numpy as np
 import pytest
 import torch
-from torch_geometric import transforms
 from torch_geometric.data import Data, InMemoryDataset
 from torch_geometric.loader import DataLoader
 from torch_geometric.transforms import NormalizeScale, SamplePoints
 
-from qs3.datasets import pyg
 from qs3.datasets.domain import Domain
 from qs3.datasets.pyg import from_pyg, knn_graph, to_pyg
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.store.store import ManifestRow, write_pointset
-from tests.composing import compose
 
 CLASSES = ("box", "cup", "pen")
 RNG = np.random.default_rng(0)
@@ -44,16 +39,6 @@ def ours(tmp_path):
 
 def domain(folder, classes=CLASSES):
     return Domain("mine", "X", "mine", folder, classes=classes)
-
-
-def test_the_examples_of_the_module_are_for_clouds_and_for_classes_of_ones_own(ours):
-    (name, count) = re.search(r"transform=(\w+)\((\d+)\)", pyg.__doc__).groups()
-    thinned = to_pyg(ours, "train", transform=getattr(transforms, name)(int(count)))
-    assert thinned[0].pos.shape == (int(count), 3)
-    line = re.search(r"python train.py(.*?)\n\n", pyg.__doc__, re.DOTALL)[1]
-    cfg = compose("train", shlex.split(line.replace("\\\n", " ")))
-    assert cfg.num_classes == len(cfg.data.source.classes)
-    assert cfg.data.source.classes == cfg.data.target.classes
 
 
 def test_a_split_as_pyg_has_it(ours):
@@ -161,11 +146,6 @@ def test_what_does_not_fit_is_refused(tmp_path, items):
     assert not (tmp_path / "a" / "meta.yaml").exists()
 
 
-def test_names_of_classes_must_come_from_somewhere(tmp_path):
-    with pytest.raises(ConfigError):
-        from_pyg({"train": clouds(4, y=torch.tensor([2]))}, tmp_path / "a")
-
-
 class Numbered(InMemoryDataset):
     """Clouds with numbers for ids, which collating makes tensors."""
 
@@ -194,15 +174,6 @@ def test_edges_equal_brute_force(sizes, loop, columns):
     batch = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
     found = knn_graph(x, None if len(sizes) == 1 else batch, 6, loop=loop)
     assert [tuple(edge) for edge in found.T.tolist()] == slow_edges(x, batch, 6, loop)
-
-
-def test_copies_of_a_point_are_not_its_own_neighbours():
-    x = torch.zeros(12, 3)
-    x[6:] = torch.arange(6.0)[:, None]
-    source, target = knn_graph(x, None, 4)
-    assert (source != target).all()
-    assert torch.bincount(target).tolist() == [4] * 12
-    assert (x[source[target < 6]] == 0).all()  # of seven copies, all four are at distance 0
 
 
 def test_edges_refuse_what_pyg_would_mix_up():

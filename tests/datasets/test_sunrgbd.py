@@ -5,9 +5,8 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from scipy.io import loadmat, savemat
 
-from qs3.datasets.sunrgbd import millimetres, read_frames
+from qs3.datasets.sunrgbd import millimetres
 from qs3.errors import Qs3Error
 from qs3.store.store import is_finished, read_manifest
 from tests.composing import compose_domain
@@ -105,18 +104,3 @@ def test_the_raw_depth_is_taken(copy):
     data = domain.open()
     (lost,) = [row for row in read_manifest(domain.folder, data.classes) if not row.cls]
     assert str(first.parent) in lost.reason
-
-
-@pytest.mark.slow
-def test_a_box_that_is_none_costs_only_itself(copy):
-    path = copy / "published" / "sunrgbd" / "SUNRGBDMeta3DBB_v2.mat"
-    meta = loadmat(path)["SUNRGBDMeta"]
-    meta[0, 0]["groundtruth3DBB"][0, 0]["basis"] = np.zeros((3, 3))
-    savemat(path, {"SUNRGBDMeta": meta})
-    frames = read_frames(path.parent)
-    assert frames[0].boxes[0].box is None
-    domain = compose_domain("sunrgbd", {"paths.data_dir": str(copy)})
-    data = domain.open()
-    rows = read_manifest(domain.folder, data.classes)
-    (lost,) = [row for row in rows if "not those of a box" in row.reason]
-    assert (lost.cls, lost.more["frame"]) == ("chair", "1")

@@ -1,11 +1,11 @@
-"""Up is found by the floor, by an accelerometer of unknown mounting, and by a room's planes."""
+"""Up is found by the floor, and by a room's planes."""
 
 import numpy as np
 import pytest
 
 from qs3.datasets.depth_images import Pinhole
-from qs3.datasets.vertical import angle_deg, floor_up, mounting, planes_up, planes_up_steep
-from tests.fixtures.frame_files import SENSOR_FROM_CAMERA, Shot, Thing, kinect
+from qs3.datasets.vertical import angle_deg, floor_up, planes_up, planes_up_steep
+from tests.fixtures.frame_files import Shot, Thing, kinect
 
 TILTS = [(5, 0), (14, 3), (25, -4), (-3, 6)]
 
@@ -40,26 +40,9 @@ def test_planes(pitch, roll):
     assert planes_up(np.zeros((60, 80)), Pinhole(*one.camera)) is None
 
 
-def test_accelerometer_of_any_mounting():
-    rng = np.random.default_rng(0)
-    ups = np.stack([shot(*rng.uniform((-5, -6), (35, 6))).up_in_camera for _ in range(40)])
-    for turn in (SENSOR_FROM_CAMERA, np.diag([1.0, -1, 1])):  # the second is a mirror image
-        readings = 9.81 * ups @ turn.T + rng.normal(0, 0.05, ups.shape)
-        readings[:3] = rng.normal(size=(3, 3))  # somebody pushed the camera
-        found = mounting(readings, ups)
-        assert found.error_deg < 1
-        assert max(angle_deg(found.up(turn @ up), up) for up in ups) < 2
-    noise = mounting(rng.normal(size=(40, 3)), ups)
-    assert noise.error_deg > 5  # which the importer does not use
-    assert mounting(readings[:4], ups[:4]) is None
-    assert found.up(np.zeros(3)) is None
-
-
 @pytest.mark.parametrize("pitch", [10, 20, 30])
-@pytest.mark.parametrize("noise_m", [0.0, 0.005])
-@pytest.mark.parametrize("holes", [0.0, 0.05])
-@pytest.mark.parametrize("width", [640, 320, 224, 160])
-def test_planes_of_small_pictures(width, holes, noise_m, pitch):
+@pytest.mark.parametrize("width", [640, 160])
+def test_planes_of_small_pictures(width, pitch):
     """A floor 1.2 m below the camera and a wall 4.5 m before it, by a camera of 63 degrees."""
     height, focal = width * 3 // 4, 525 * width / 640
     camera = Pinhole(focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -69,8 +52,8 @@ def test_planes_of_small_pictures(width, holes, noise_m, pitch):
     floor, wall = 1.2 / np.maximum(-(rays @ up), 1e-9), 4.5 / np.maximum(rays @ ahead, 1e-9)
     depth = np.minimum(floor, wall)
     rng = np.random.default_rng(0)
-    depth += noise_m * rng.normal(size=depth.shape)
-    depth[rng.random(depth.shape) < holes] = 0  # all over the picture, mostly single pixels
+    depth += 0.005 * rng.normal(size=depth.shape)
+    depth[rng.random(depth.shape) < 0.05] = 0  # all over the picture, mostly single pixels
     found, sure = planes_up_steep(depth, camera)
     assert sure
     assert angle_deg(found, up) < 1
