@@ -9,14 +9,6 @@ from tests.training.toy import overrides
 
 CASES = {
     "a toy run": ("train", overrides),
-    "another scheme": (
-        "train",
-        lambda root: overrides(root, "selftraining=cbst", "seed=3", "selftraining.init=continue"),
-    ),
-    "an experiment's own value": (
-        "train",
-        lambda root: ["experiment=qs3_s2d", f"paths.data_dir={root}", "protocol.epochs=1"],
-    ),
     "a key that is added": (
         "train",
         lambda root: ["+model.own=x", f"model.own={root}", "~model.dropout"],
@@ -31,10 +23,6 @@ CASES = {
     "the last word counts": (
         "train",
         lambda root: [f"paths.log_dir={root}", "seed=1", "paths.log_dir=null", "seed=2"],
-    ),
-    "no command": (
-        None,
-        lambda root: ["+domain@data.source=own", "+paths=default", f"paths.data_dir={root}"],
     ),
 }  # fmt: skip
 

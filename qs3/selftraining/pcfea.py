@@ -8,10 +8,9 @@ of the warm-up that stands among the selectors, as one of them may choose its po
 
 from __future__ import annotations
 
-import copy
 import math
 from decimal import Decimal
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,7 +23,6 @@ from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.kernels.norms import begin_target_norms, use_domain
 from qs3.methods.base import Method, Weight, class_loss
-from qs3.methods.sd import move_towards
 from qs3.selftraining.selectors import (
     TeacherPredictions,
     chosen_by,
@@ -41,11 +39,11 @@ Share = Annotated[float, Interval(ge=0, lt=1)]
 
 
 class Pcfea(Method):
-    r"""L = CE(z_j + λ/2 (w_j - w_y)' S_y (w_j - w_y) + a (w_j - w_y)' (m_y - s_y)) + w [A_s + A_t].
+    r"""L = CE(z_j + λ/2 (w_j - w_y)' S_y (w_j - w_y) + λ (w_j - w_y)' (m_y - s_y)) + w [A_s + A_t].
 
     z: logits of a source cloud of class y; w_j: rows of the head's last, linear layer, f its input
     [B, D]; λ = strength p, p the progress. The first term bounds from above the mean cross-entropy
-    of features f + a (m_y - s_y) + N(0, λ S_y): the source's in the target's style. A:
+    of features f + λ (m_y - s_y) + N(0, λ S_y): the source's in the target's style. A:
     cross-entropy of cos(f, m_c) / 2 as logits of class c, A_s against the source's labels and A_t
     against the target's present predictions.
 
@@ -58,28 +56,17 @@ class Pcfea(Method):
     Args:
         strength: 0.25; 0 leaves the styling out.
         align_weight: w; 1; 0 leaves the alignment out.
-        shift: a is "growing", λ, as in the class that the released logs name, "full", 1, as in the
-            released one, or "none", 0, as in a third one of its file.
         plain: e_0 / E, rounded up to whole epochs, in [0, 1): 0.1. An epoch must be left, so E >= 2
             unless it is 0.
         every: epochs between two pools, of E: 0.05.
         selector: which clouds of the target are in the pool: None for the growing share, or a
             selector of `selftraining`, such as QBST; pools count as its rounds.
         theta: of that selector.
-        pool: "share", as above, or "threshold", the released code's default: of the source what the
-            net names rightly with a probability above t, of the target what it names with one above
-            1 - t; t is `every` in the first pool and grows evenly over
-            the epochs, by 1 - e_0 / E in all.
-        rank: what makes a source cloud probable: "label", the probability of its label, or "most",
-            as in the released code, that of the class which the net names, right or wrong.
-        momentum: m; pools are made by a running mean of the net, which takes 1 - m of its weights
-            and statistics a step: 0.99 in the released code. 0: by the net itself.
     """
 
     uses_target: ClassVar[bool] = True
     mean: Tensor
     source_mean: Tensor
-    part: Tensor
     covariance: Tensor
 
     @checked
@@ -87,22 +74,16 @@ class Pcfea(Method):
         self,
         strength: Weight = 0.25,
         align_weight: Weight = 1.0,
-        shift: Literal["growing", "full", "none"] = "growing",
         plain: Share = 0.1,
         every: Annotated[float, Interval(gt=0, le=1)] = 0.05,
         selector: Any = None,
         theta: Share = 0.8,
-        pool: Literal["share", "threshold"] = "share",
-        rank: Literal["label", "most"] = "label",
-        momentum: Share = 0.0,
     ) -> None:
         super().__init__()
         self.strength, self.align_weight = strength, align_weight
-        self.shift, self.pool, self.rank, self.momentum = shift, pool, rank, momentum
         self.plain, self.every, self.theta = plain, every, theta
         self.selector = selector
         self.styled = False  # whether there is a pool
-        self.teacher: Any = None  # the running mean, if there is one
 
     def prepare(self, net: Any) -> None:
         """Room for the figures of a pool, which a checkpoint holds."""
@@ -110,27 +91,20 @@ class Pcfea(Method):
         self.register_buffer("mean", torch.zeros(classes, width))
         self.register_buffer("source_mean", torch.zeros(classes, width))
         self.register_buffer("covariance", torch.zeros(classes, width, width))
-        if self.momentum:
-            self.teacher = copy.deepcopy(net).requires_grad_(False)
-            self.register_buffer("part", torch.tensor(1 - self.momentum))
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Terms "ce", and once there is a pool "align_source" and "align_target"; each >= 0."""
-        if self.teacher is not None and batch.get("step_begins", True):
-            move_towards(self.teacher, net, self.part)
         source = batch["source"]
         f, z = penultimate(net, source["points"])
         labels = source["y_source"]
         if not self.styled:
             return {"ce": class_loss(z, labels, self.smoothing)}
         grown = self.strength * batch["progress"]
-        a = {"growing": grown, "full": 1.0 if self.strength else 0.0, "none": 0.0}[self.shift]
         with torch.autocast(z.device.type, enabled=False):
-            added = style(
-                net.head[-1].weight, self.covariance, self.mean - self.source_mean, grown, a
-            )
+            shift = self.mean - self.source_mean
+            added = style(net.head[-1].weight, self.covariance, shift, grown)
         terms = {"ce": class_loss(z + added[labels], labels, self.smoothing)}
         if self.align_weight:
             with use_domain(net, "target"):
@@ -151,27 +125,21 @@ class Pcfea(Method):
         if not self.styled or (epoch - first) % between:
             return
         if epoch == first:
-            for one in (net, self.teacher) if self.teacher is not None else (net,):
-                begin_target_norms(one)
+            begin_target_norms(net)
         size, classes = data.eval_batch_size, len(self.mean)
-        labels, asked = data.labelled.labels.numpy(), self.teacher or net
-        f, p = _features(asked, data.labelled.clouds.points, size, "source", self.mean.device)
-        g, q = _features(asked, data.target.points, size, "target", self.mean.device)
+        labels = data.labelled.labels.numpy()
+        f, p = _features(net, data.labelled.clouds.points, size, "source", self.mean.device)
+        g, q = _features(net, data.target.points, size, "target", self.mean.device)
         said = TeacherPredictions.of(q, data.target.ids)
         named = said.predicted
-        if self.pool == "threshold":
-            t = (epoch - first) / epochs + self.every
-            of_source = (p.argmax(axis=1) == labels) & (p.max(axis=1) > t)
-            of_target = said.confidence > 1 - t
-        else:
-            progress = (epoch - first) / (epochs - first)
-            by = labels if self.rank == "label" else p.argmax(axis=1)
-            own, ids = p[np.arange(len(p)), by], data.labelled.ids
-            of_source = most_confident(own, labels, 1 - progress, ids, doubts(p, by))
+        progress = (epoch - first) / (epochs - first)
+        own, ids = p[np.arange(len(p)), labels], data.labelled.ids
+        of_source = most_confident(own, labels, 1 - progress, ids, doubts(p, labels))
+        if self.selector is None:
             of_target = most_confident(
                 said.confidence, named, progress, data.target.ids, said.doubt
             )
-        if self.selector is not None:
+        else:
             chosen = chosen_by(self.selector, said, self.theta, (epoch - first) // between)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels
         source_mean, _ = moments(f, torch.from_numpy(labels), classes)
@@ -213,13 +181,12 @@ def style(
     covariance: Float[Tensor, "c d d"],
     shift: Float[Tensor, "c d"],
     grown: float,
-    a: float,
 ) -> Float[Tensor, "c c"]:
     """What is added to the logit of class j (column) for a feature of class y (row); 0 for y."""
     apart = weights[None] - weights[:, None]  # [y, j, d]: w_j - w_y
     spread = ((apart @ covariance) * apart).sum(dim=2)  # [y, j]
     moved = (apart @ shift[:, :, None])[:, :, 0]  # [y, j]
-    return grown / 2 * spread + a * moved
+    return grown / 2 * spread + grown * moved
 
 
 def moments(

@@ -48,33 +48,6 @@ def test_the_targets_training_clouds_are_what_the_adaptation_predicts(data_dir):
     assert torch.equal(found, target.train.points)
 
 
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # Lightning's on trainers without a loader
-@pytest.mark.parametrize("where", ["cpu", "cuda", "meta"])
-def test_batches_are_pinned_for_a_gpu_alone(data_dir, monkeypatch, where):
-    """Memory cannot be pinned where there is no GPU, so what asks for it is counted."""
-    asked = []
-    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda x: asked.append(len(x)) or x)
-    data = adaptation(data_dir)
-    data.trainer = Trainer(accelerator="cpu", devices=1, logger=False, barebones=True)
-    root = property(lambda _: torch.device(where))
-    monkeypatch.setattr(type(data.trainer.strategy), "root_device", root)
-    for loader, name in (
-        (data.train_dataloader(), "source"),
-        (data.predict_dataloader(), "target"),
-    ):
-        asked.clear()
-        points = next(iter(loader))[name]["points"]
-        assert (len(points) in asked) == (where == "cuda")
-        assert bool(asked) == (where == "cuda")
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
-def test_memory_of_batches_is_pinned(data_dir):
-    data = adaptation(data_dir)
-    data.trainer = Trainer(accelerator="gpu", devices=1, logger=False, barebones=True)
-    assert next(iter(data.train_dataloader()))["source"]["points"].is_pinned()
-
-
 def test_the_adaptation_has_the_source_s_labels_and_no_test_clouds(data_dir):
     data = adaptation(data_dir)
     source = made(data_dir)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scipy.optimize import linprog
 
 from qs3.datamodules.augment import REGION_SHARE, Augment, augmented, crop, drop_regions, rotate_z
 
@@ -44,12 +45,6 @@ def test_scale_and_shift_are_of_each_cloud_and_axis():
     assert moved.max() < 1.5 + 0.2
 
 
-def test_all_off_changes_nothing():
-    points = torch.rand(2, 3, 3)
-    off = Augment(rotate_z=False, jitter_sigma=0.0)
-    assert torch.equal(off(points, generator()), points)
-
-
 @pytest.mark.parametrize(
     "settings",
     [
@@ -90,16 +85,6 @@ def test_one_region_is_one_hole_of_a_tenth_to_a_quarter():
     assert not torch.equal(holed, drop_regions(points, 1, generator(1)))
 
 
-def test_what_is_left_stays_in_its_place_and_the_rest_repeats_it():
-    points = torch.rand(8, 100, 3, generator=generator())
-    holed = drop_regions(points, 3, generator(1))
-    for before, after in zip(points, holed, strict=True):
-        stays = (before == after).all(dim=1)
-        known = {tuple(p) for p in before[stays].tolist()}
-        assert {tuple(p) for p in after.tolist()} == known
-        assert 25 <= len(known) <= 90
-
-
 def test_one_to_three_regions_are_about_equally_frequent():
     n = 300
     holed = drop_regions(line(600, n), 3, generator())
@@ -126,15 +111,12 @@ def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
             (before[stays] - move).mean(dim=0), torch.zeros(3).double(), atol=2e-4
         )
         shares.append(float(stays.float().mean()))
-        if not stays.all():  # some plane has them on one side: a support vector machine by force
-            from scipy.optimize import linprog
-
+        if not stays.all():  # some plane has them on one side
             sign = torch.where(stays, 1.0, -1.0)[:, None]
             rows = -(sign * torch.cat([before, torch.ones(50, 1)], dim=1)).numpy()
             found = linprog([0.0] * 4, rows, [-1.0] * 50, bounds=[(None, None)] * 4)
             assert found.status == 0
     assert min(shares) >= 0.4
-    assert len({round(s, 2) for s in shares}) > 15
     assert 0.6 < sum(shares) / 64 < 0.8
 
 

@@ -79,12 +79,6 @@ def test_processes_share_the_clouds_equally(n):
     assert set().union(*parts) == set(range(n))
 
 
-def test_the_first_table_decides_the_length():
-    both = Batches({"a": part(10), "b": part(3)}, 4, seed=0, epoch=0)
-    assert [len(batch["b"]["y"]) for batch in both] == [4, 4, 2]
-    assert sorted(seen(both, "b")[:3]) == [0, 1, 2]
-
-
 # --- one of several samples -------------------------------------------------------------------
 
 
@@ -139,20 +133,6 @@ def test_no_cloud_twice_before_all_of_its_class():
     assert times[:5].sum() == pytest.approx(50, abs=25)
 
 
-def test_a_class_that_does_not_occur_is_not_drawn():
-    classes = torch.tensor([2, 2, 7, 7, 7])
-    assert set(balanced(classes, torch.Generator()).tolist()) <= set(range(5))
-
-
-def test_processes_get_different_clouds_of_a_balanced_epoch():
-    drawn = []
-    for rank in range(2):
-        one = batches(400, balanced=True, rank=rank, world=2)
-        drawn.append({*one._order("a", one.parts["a"]).tolist()})
-    assert len(drawn[0]) > 60
-    assert drawn[0] & drawn[1] <= {0}  # the only cloud of its class
-
-
 @pytest.mark.slow
 @given(
     n=st.integers(2, 30),
@@ -189,11 +169,6 @@ def test_on_a_way_every_cloud_comes_before_any_comes_again(n, size):
     way = seen(batches(n, size, piece=Piece(0, 0, -(-passes * n // size))))
     for i in range(passes):
         assert sorted(way[i * n : (i + 1) * n]) == list(range(n))
-
-
-def test_two_phases_take_different_ways():
-    first, second = (seen(batches(20, piece=Piece(way, 0, 5))) for way in (0, 5))
-    assert first != second
 
 
 def test_a_second_draw_is_another_sample_of_the_same_cloud():

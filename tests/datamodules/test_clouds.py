@@ -31,12 +31,6 @@ def test_batch_equals_the_normalised_clouds_to_the_bit(mapped):
         assert np.array_equal(points, unit_ball(STORED[i])[ORDER[i, s]])
 
 
-def test_without_choice_the_whole_cloud_in_its_order():
-    clouds = Clouds.of(STORED)
-    assert clouds.starts == 1
-    assert np.array_equal(clouds.points.numpy(), unit_ball(STORED))
-
-
 def test_in_metres_clouds_are_centred_and_keep_their_size():
     corners = np.array([[0, 0, 0], [4, 0, 0], [0, 2, 0], [4, 2, 0]], dtype=np.float32)
     stored = np.stack([corners, 2 * corners]) + np.float32(8)
@@ -79,14 +73,3 @@ def test_a_part_shares_the_clouds(mapped):
     assert torch.equal(part.points, mapped.points[[4, 2]])
     again = part.at(np.array([False, True]))
     assert torch.equal(again.points, mapped.points[[2]])
-
-
-def test_a_cloud_of_one_repeated_point_becomes_zeros():
-    clouds = Clouds.of(np.full((1, 9, 3), 5.3, dtype=np.float32))
-    assert not clouds.points.any()
-
-
-def test_nothing_of_a_map_is_copied(mapped):
-    held = (mapped.stored, mapped.order)
-    assert all(isinstance(array, np.memmap) for array in held)
-    assert mapped.centre.nbytes + mapped.radius.nbytes + mapped.rows.nbytes == 5 * (12 + 4 + 8)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 
-import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -23,20 +22,6 @@ def test_the_file_names_every_setting():
     assert set(plain) == {"_target_", *takes} - left_out
     ours = {key: takes[key].default for key in plain if key not in ("_target_", "domain")}
     assert {key: plain[key] for key in ours} == ours
-
-
-def test_hydra_builds_it_and_it_gives_batches(tmp_path):
-    write_domain(tmp_path, "modelnet10", noise=0.05)
-    words = ["domain=modelnet10", "points=32", f"data_dir={tmp_path}", "batch_size=8"]
-    words = ["+datamodule=domain", *(f"datamodule.{word}" for word in words)]
-    data = instantiate(composed(None, *words).datamodule)
-    data.prepare_data()
-    data.setup()
-    batch = next(iter(data.train_dataloader()))
-    assert set(batch) == {"points", "labels", "index", "epoch"}
-    assert batch["points"].shape == (8, 32, 3)
-    assert batch["labels"].dtype == torch.int64
-    assert sum(len(batch["labels"]) for batch in data.test_dataloader()) == 24
 
 
 def test_in_an_application_of_one_s_own(tmp_path):

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import errno
-import logging
-import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import qs3.utils.files
 from qs3.datamodules import fps_samples
-from qs3.datamodules.clouds import prepare
 from qs3.datamodules.fps_samples import (
     farthest_points,
-    remove_old_leftovers,
     sample,
     sample_all,
     start_points,
@@ -48,29 +41,10 @@ def test_each_sample_is_farthest_point_sampling_from_its_start():
             assert np.array_equal(chosen, farthest_point_sampling_np(ball, 10, start))
 
 
-def test_indices_that_do_not_fit_into_sixteen_bits():
-    cloud = np.random.default_rng(1).normal(size=(1, 40_000, 3)).astype(np.float32)
-    order = sample(cloud, 300, 1)
-    assert order.dtype == np.int32
-    assert order.max() > 32_767
-    assert order.min() >= 0
-
-
 def test_processes_do_not_change_the_result(monkeypatch):
     monkeypatch.setattr(fps_samples, "_CHUNK", 2)
     assert np.array_equal(sample_all(CLOUDS, 10, 3, processes=2), sample(CLOUDS, 10, 3))
     assert np.array_equal(sample_all(CLOUDS, 10, 3, processes=1), sample(CLOUDS, 10, 3))
-
-
-def test_if_there_can_be_no_processes_this_one_does_it(monkeypatch, caplog):
-    def full(*args, **kwargs):
-        raise OSError(11, "Resource temporarily unavailable")
-
-    monkeypatch.setattr(SpawnProcess, "start", full)
-    with caplog.at_level(logging.WARNING):
-        order = sample_all(CLOUDS, 10, 3, processes=2)
-    assert np.array_equal(order, sample(CLOUDS, 10, 3))
-    assert "temporarily unavailable" in caplog.text
 
 
 # --- the cache --------------------------------------------------------------------------------
@@ -94,24 +68,6 @@ def cached(folder: Path) -> Path:
     return file
 
 
-def test_the_cached_samples_serve_all_scales(tmp_path):
-    """Farthest points do not depend on a cloud's size, so one file holds those of all."""
-    ball = prepare(CLOUDS, 10, starts=2, cache_dir=tmp_path, key="key")
-    before = cached(tmp_path).read_bytes()
-    metres = prepare(CLOUDS, 10, starts=2, cache_dir=tmp_path, key="key", scale="metres")
-    assert cached(tmp_path).read_bytes() == before
-    assert np.array_equal(metres.order, ball.order)
-    for i, cloud in enumerate(CLOUDS):
-        centred = cloud - cloud[0] - (cloud - cloud[0]).mean(axis=0)
-        # sampled anew in metres, by the slow and obvious way
-        chosen, nearest = [0], np.full(len(centred), np.inf)
-        for _ in range(9):
-            nearest = np.minimum(nearest, np.linalg.norm(centred - centred[chosen[-1]], axis=1))
-            chosen.append(int(nearest.argmax()))
-        assert metres.order[i, 0].tolist() == chosen
-        assert np.array_equal(metres.points.numpy()[i], centred[chosen])
-
-
 def test_what_can_be_chosen(tmp_path):
     assert farthest_points(CLOUDS, 50, 4, tmp_path) is None  # nothing to choose
     assert list(tmp_path.iterdir()) == []
@@ -128,14 +84,6 @@ def test_cached_as_a_map(tmp_path):
     assert isinstance(again, np.memmap)
     assert np.array_equal(first, again)
     assert np.array_equal(first, sample(CLOUDS, 10, 2))
-
-
-@pytest.mark.parametrize("other", [{"count": 9}, {"starts": 3}, {"key": "other"}])
-def test_other_settings_have_another_file(tmp_path, other):
-    numbers(tmp_path)
-    first, before = cached(tmp_path), cached(tmp_path).read_bytes()
-    assert numbers(tmp_path, **other)[1]
-    assert first.read_bytes() == before
 
 
 @pytest.mark.parametrize(("what", "now"), [("_VERSION", 3), ("version", lambda name: "0.0")])
@@ -166,26 +114,6 @@ def test_damaged_cache_is_redone(tmp_path, damage):
     assert file.read_bytes() == sound
 
 
-def test_a_cache_of_other_clouds_under_this_name_is_redone(tmp_path):
-    numbers(tmp_path, key="other")
-    (old,) = tmp_path.glob("other-*.npy")
-    numbers(tmp_path)
-    (file,) = tmp_path.glob("key-*.npy")
-    os.replace(old, file)
-    assert numbers(tmp_path)[1]
-
-
-def test_a_full_disk_or_no_folder_is_a_warning(tmp_path, monkeypatch):
-    def full(path):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    (tmp_path / "file").write_text("")
-    assert np.array_equal(numbers(tmp_path / "file")[0], sample(CLOUDS, 10, 2))
-    monkeypatch.setattr(qs3.utils.files, "_flush", full)
-    assert np.array_equal(numbers(tmp_path)[0], sample(CLOUDS, 10, 2))
-    assert list(tmp_path.glob("*.npy")) == list(tmp_path.glob(".*.tmp*")) == []
-
-
 def test_interrupted_and_done_again(tmp_path, monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
@@ -212,15 +140,3 @@ def test_of_two_runs_that_start_together_one_samples(tmp_path, monkeypatch):
         runs = [both.submit(farthest_points, CLOUDS, 10, 2, tmp_path, "key") for _ in range(2)]
     assert len(calls) == 1
     np.testing.assert_array_equal(runs[0].result(), runs[1].result())
-
-
-def test_only_old_leftovers_are_removed(tmp_path):
-    numbers(tmp_path)
-    kept = cached(tmp_path)
-    names = (f".{kept.name}.old.tmp.npy", f".{kept.name}.new.tmp.npy", ".other.old.tmp.csv")
-    for name in names:
-        (tmp_path / name).write_text("")
-        if "old" in name:
-            os.utime(tmp_path / name, (1, 1))
-    remove_old_leftovers(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {".lock", kept.name, *names[1:]}

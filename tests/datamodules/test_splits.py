@@ -67,22 +67,6 @@ def test_the_order_of_the_clouds_changes_nothing(order):
     assert parts(stratified, [ids[i] for i in order], labels[list(order)]) == expected
 
 
-def test_stratified_scans_of_an_object_stay_together():
-    objects, labels = classes_of([20, 10])
-    train, validation = parts(stratified, scans_of(objects), np.repeat(labels, 4))
-    sides = [{name.partition("~")[0] for name in part} for part in (train, validation)]
-    assert not sides[0] & sides[1]
-    assert parts(stratified, objects, labels)[1] == sorted(sides[1])
-
-
-def test_objects_that_are_added_move_few_others():
-    ids, labels = classes_of([100])
-    before = set(parts(stratified, ids, labels)[1])
-    more, labels = classes_of([105])
-    after = set(parts(stratified, more, labels)[1])
-    assert len(before - after) <= 5
-
-
 def test_stratified_takes_these_everywhere():
     ids = [f"a/{i}" for i in range(40)]
     _, validation = stratified(ids, np.zeros(40, int))

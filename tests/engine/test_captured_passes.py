@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from qs3.engine.cuda_graphs import EAGER, Graphs
 from qs3.kernels.norms import use_domain
-from tests.methods.shapes import tiny_net
 from tests.models.test_all_nets import NETS, build
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -79,20 +78,6 @@ def test_a_gpu_goes_on_after_a_capture_that_failed(caplog: pytest.LogCaptureFixt
     assert [record.message[:30] for record in caplog.records] == ["no CUDA graphs of this net, st"]
     assert torch.cuda.current_stream() == torch.cuda.default_stream()
     assert all(torch.equal(found[0][key], found[1][key]) for key in found[1])
-
-
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_graphs_of_another_gpu() -> None:
-    """In one process, as jobs of `trainer=gpus_in_turn` are."""
-    for device in ("cuda:0", "cuda:1"):
-        net = tiny_net().to(device)
-        graphs = Graphs(net)
-        for _ in range(EAGER + 2):
-            graphs.begin_step()
-            points = torch.rand(4, 16, 3, device=device)
-            found = graphs.stand_in.features(points).global_
-        assert graphs.backbone.graphs
-        assert torch.equal(found, net.features(points).global_)
 
 
 def _steps_on_a_gpu(name: str, norm: str, features: bool, graphs: bool) -> dict[str, Tensor]:

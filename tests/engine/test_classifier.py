@@ -63,14 +63,6 @@ def test_a_method_s_copy_of_the_net_has_no_hooks_and_does_not_learn() -> None:
     assert {"method.steps", "method.teacher.head.0.weight"} <= names
 
 
-def test_heads_are_optimised() -> None:
-    classifier = _classifier(Dann())
-    optimised = classifier.configure_optimizers()["optimizer"].param_groups
-    assert len(optimised) == 1
-    parts = (classifier.net, classifier.method)
-    assert len(optimised[0]["params"]) == sum(len(list(part.parameters())) for part in parts)
-
-
 def test_each_module_has_its_learning_rate() -> None:
     classifier = _classifier(PointDan(classifier_rate=3.0), build_net=lambda: pointdan(4, nodes=4))
     groups = classifier.configure_optimizers()["optimizer"].param_groups

@@ -7,7 +7,6 @@ calls, each written over by the next. What a GPU makes of them: test_captured_pa
 from __future__ import annotations
 
 import copy
-import weakref
 from typing import Any
 
 import pytest
@@ -17,10 +16,9 @@ from torch.func import functional_call
 
 from qs3 import kernels as fast
 from qs3.engine import cuda_graphs
-from qs3.engine.cuda_graphs import EAGER, MOST, Graphs, _Passes
+from qs3.engine.cuda_graphs import EAGER, Graphs, _Passes
 from qs3.errors import DataError
 from qs3.kernels.norms import use_domain
-from qs3.models.base import Features, PointClassifier
 from qs3.models.dgcnn import dgcnn
 from tests.methods.cases import CASES, batch_of, total
 from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
@@ -122,18 +120,6 @@ def test_what_comes_once_an_epoch_is_not_captured() -> None:
     assert Played.made == 1
 
 
-def test_graphs_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda_graphs, "EAGER", 0)
-    monkeypatch.setattr(cuda_graphs, "_KNOWN", 5)
-    graphs = Graphs(tiny_net(), Played)
-    for n in range(16, 16 + MOST + 3):
-        for _ in range(3):
-            graphs.begin_step()
-            graphs.stand_in(torch.randn(4, n, 3))
-    assert Played.made == MOST
-    assert len(graphs.whole.seen) <= 6
-
-
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each pass is captured when it comes the first time."""
@@ -155,17 +141,6 @@ def test_passes_of_a_step_have_graphs_of_their_own() -> None:
         for p, q in zip(net.parameters(), plain.parameters(), strict=True):
             assert torch.equal(p.grad, q.grad)
     assert Played.made == 2
-
-
-@pytest.mark.usefixtures("at_once")
-def test_what_a_method_keeps_is_not_written_over() -> None:
-    graphs = Graphs(tiny_net(), Played)
-    kept = graphs.stand_in.features(torch.randn(4, 16, 3)).global_.detach()
-    value = kept.clone()
-    graphs.begin_step()
-    graphs.stand_in.features(torch.randn(4, 16, 3))
-    assert Played.made == 1
-    assert torch.equal(kept, value)
 
 
 @pytest.mark.usefixtures("at_once")
@@ -217,27 +192,6 @@ def test_whatever_a_graph_depends_on_has_its_own() -> None:
     assert made() == 0
     graphs.forget()
     assert made() == 1
-
-
-@pytest.mark.usefixtures("at_once")
-def test_forgotten_graphs_are_gone_at_once() -> None:
-    """Though what torch makes of a pass refers to itself."""
-    made: list[Any] = []
-
-    def capture(module: nn.Module, points: Tensor) -> Any:
-        played: Any = Played(module, points)
-        played.itself = played
-        made.append(weakref.ref(played))
-        return played
-
-    plain, points = tiny_net(), torch.randn(4, 16, 3)
-    graphs = Graphs(plain, capture)
-    for _ in range(2):
-        graphs.begin_step()
-        graphs.stand_in(points).sum().backward()
-    assert [one() is None for one in made] == [False]
-    graphs.forget()
-    assert [one() is None for one in made] == [True]
 
 
 @pytest.mark.usefixtures("at_once")
@@ -319,21 +273,6 @@ def test_what_cannot_be_captured_goes_on_without(caplog: pytest.LogCaptureFixtur
     )
 
 
-@pytest.mark.usefixtures("at_once")
-def test_more_than_tensors_cannot_be_captured(caplog: pytest.LogCaptureFixture) -> None:
-    class Zero(type(tiny_net().backbone)):  # type: ignore[misc]
-        def forward(self, points: Tensor) -> Any:
-            return super().forward(points)._replace(regulariser=0.0)
-
-    def run(module: nn.Module, points: Tensor) -> Any:
-        module(points)
-
-    plain = tiny_net()
-    plain.backbone.__class__ = Zero
-    assert Graphs(plain, run).stand_in.features(torch.randn(4, 16, 3)).regulariser == 0.0
-    assert "Zero returns more than tensors and None" in caplog.text
-
-
 def test_the_stand_in_is_the_net_but_for_its_passes() -> None:
     plain = tiny_net()
     net = Graphs(plain).stand_in
@@ -346,19 +285,3 @@ def test_the_stand_in_is_the_net_but_for_its_passes() -> None:
         assert copied is not plain
     with pytest.raises(DataError, match="NaN"):
         net.features(torch.full((1, 1, 3), 0.0).index_fill(2, torch.tensor([0]), float("nan")))
-
-
-@pytest.mark.usefixtures("at_once")
-def test_features_of_a_net_s_own_are_asked_of_it() -> None:
-    class Halved(PointClassifier):
-        def features(self, points: Tensor) -> Features:
-            return Features(super().features(points).global_ / 2, None)
-
-    plain = tiny_net()
-    net = Graphs(Halved(plain.backbone, plain.head), Played).stand_in
-    points = torch.randn(4, 16, 3)
-    torch.manual_seed(0)
-    expected = plain.features(points).global_ / 2
-    torch.manual_seed(0)
-    assert torch.equal(net.features(points).global_, expected)
-    assert Played.made == 0

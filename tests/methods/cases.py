@@ -68,7 +68,6 @@ CASES = {
     "twin": Case(Twin, 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),
-    "pcfea_averaged": Case(lambda: _styled(momentum=0.99), 2),
     "student": Case(Student, 1, source=False, pseudo="hard"),
     "student_source": Case(lambda: Student(weight_step=0.005), 2, pseudo="hard"),
     "student_source_pcm": Case(lambda: Student(pcm=True), 2, pseudo="hard"),

@@ -27,17 +27,6 @@ def test_means_count_the_steps_of_the_optimiser(toy):
     assert saved["state_dict"]["method.steps"] == saved["global_step"]
 
 
-def test_the_mean_that_makes_pools_moves_as_often(toy, monkeypatch):
-    parts = []
-    monkeypatch.setattr(
-        "qs3.selftraining.pcfea.move_towards", lambda mean, net, part: parts.append(float(part))
-    )
-    cfg = toy("method=pcfea", "method.momentum=0.9", *SETTINGS)
-    train(cfg)
-    steps = load(hashing.run_folder(cfg) / "last.ckpt")["global_step"]
-    assert parts == pytest.approx([0.1] * steps)
-
-
 @pytest.mark.parametrize("precision", ["bf16-true", "16-true"])
 def test_a_mean_of_weights_in_half_precision_is_refused(toy, precision):
     """Else it stands still: 1 - 0.999 of a weight's change is less than its last bit."""

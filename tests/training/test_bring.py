@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from qs3.errors import MissingDataError, Qs3Error
+from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.runs.checkpoints import save
 from qs3.runs.folder import write_started
 from qs3.training.resume import bring, take_checkpoint
 from qs3.training.run import Run, run_of
+from qs3.utils.locks import owned
 from tests.training.toy import toy_config
 
 STARTED = {
@@ -93,6 +94,19 @@ def test_another_run_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(MissingDataError, match="not the folder of this run"):
         take_checkpoint(run, STARTED)
     assert not run.folder.exists()
+
+
+def test_a_run_on_other_data_or_in_training_is_refused(tmp_path: Path) -> None:
+    there = begin(tmp_path / "elsewhere" / run_with(tmp_path).folder.name)
+    run = run_with(tmp_path, f"ckpt_path={there}")
+    with pytest.raises(DataError, match=r"data\.target"):
+        take_checkpoint(run, STARTED | {"data": {"source": "5", "target": "8"}})
+    with owned(there.parent), pytest.raises(Qs3Error, match="another process"):
+        take_checkpoint(run, STARTED)
+    assert not run.folder.exists()
+    there.with_name("started.json").unlink()
+    with pytest.raises(MissingDataError):
+        take_checkpoint(run, STARTED)
 
 
 def test_what_going_on_takes_and_nothing_else(tmp_path: Path) -> None:

@@ -7,15 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from qs3.config import hashing
 from qs3.training import reuse as code
 from qs3.training.command import train
-from qs3.training.provenance import versions, warn_of_changes
 from qs3.training.reuse import changed_files, files_sha256
-from qs3.training.shared_warmup import warmup_sha256
 
 NET = "from tests.training.toy import TinyNet\n\n\nclass Net(TinyNet):\n    pass\n"
 ROOT = Path(code.__file__).parents[1]
@@ -54,21 +51,6 @@ def test_own_files_count_as_they_were_when_the_process_began(own, monkeypatch):
     assert of("my_own_nets.Net") not in (first, second)
 
 
-def test_code_of_qs3_counts(monkeypatch):
-    assert all((ROOT / name).is_dir() for name in code.PACKAGES)
-    before = of("")
-    code._sha256.cache_clear()
-    monkeypatch.setattr(code, "PACKAGES", code.PACKAGES[:-1])
-    assert of("") != before
-    code._sha256.cache_clear()
-
-
-def test_a_warm_up_is_known_by_its_code():
-    started = {"data": 1, "versions": 2, "threads": 1, "files": {"a": "a"}}
-    cfg = OmegaConf.create({"model": {"k": 1}})
-    assert warmup_sha256(cfg, started) != warmup_sha256(cfg, {**started, "files": {"a": "b"}})
-
-
 @pytest.mark.slow
 def test_a_warm_up_of_a_net_that_was_edited_is_trained_again(own, toy, caplog):
     """It went on from the old net's checkpoint, even where its run had been deleted."""
@@ -81,35 +63,3 @@ def test_a_warm_up_of_a_net_that_was_edited_is_trained_again(own, toy, caplog):
         train(cfg)
         assert ("the warm-up was trained before" in caplog.text) == taken
         shutil.rmtree(hashing.run_folder(cfg))
-
-
-SELECTOR = "from qs3.selftraining.selectors import Spst\n\n\nclass Mine(Spst):\n    pass\n"
-
-
-def test_a_finished_run_says_that_code_has_changed_since(own, toy, caplog):
-    """Its result is that of the code before; and a selector is run by no warm-up."""
-    caplog.set_level("INFO")
-    own.write_text(SELECTOR)
-    one_round = ("selftraining=spst", "selftraining.rounds=1", "selftraining.epochs=1")
-    mine = "selftraining.selector._target_=my_own_nets.Mine"
-    cfg = toy(*one_round, mine, "protocol.epochs=1", "selftraining.theta=0.01")
-    for edit, said in (("", "already finished (force"), ("    a = 1\n", "before an edit of {} (")):
-        train(cfg)
-        own.write_text(own.read_text() + edit)
-        code._sha256.cache_clear()
-        caplog.clear()
-        train(cfg)
-        assert said.format(own.parent) in caplog.text
-
-
-def test_a_run_that_goes_on_by_another_selector_says_so(own, caplog):
-    own.write_text(SELECTOR)
-    cfg = OmegaConf.create({"selftraining": {"selector": {"_target_": "my_own_nets.Mine"}}})
-    started = {"versions": versions(), "threads": torch.get_num_threads()}
-    started |= {"files": files_sha256(cfg)}
-    warn_of_changes(started)
-    assert not caplog.text
-    own.write_text(SELECTOR.replace("pass", "a = 1"))
-    code._sha256.cache_clear()
-    warn_of_changes(started)
-    assert f"begun with {own.parent} " in caplog.text

@@ -24,9 +24,3 @@ def test_compiled_training_comes_to_the_same(toy):
     assert a.keys() == b.keys()  # names of weights stay
     for name in a:
         np.testing.assert_allclose(a[name], b[name], atol=0.3, err_msg=name)
-
-
-def test_it_is_off_and_another_run_when_it_is_on(toy):
-    cfg = toy()
-    assert cfg.compile is False
-    assert hashing.config_sha256(toy("compile=true")) != hashing.config_sha256(cfg)

@@ -66,20 +66,6 @@ def test_a_run_does_not_go_on_with_another_classifier(toy, finished, tmp_path):
                   f"ckpt_path={moved}", "paths.warmup_dir=null"))  # fmt: skip
 
 
-def test_a_students_shares_are_of_its_own_source(toy, finished, tmp_path):
-    """Beside pseudo-labels it is trained on the run's source, not on its teacher's."""
-    result = read_result(finished)
-    uneven = (0.8, 0.1, 0.1)
-    write_result(tmp_path / "teacher.pt", replace(result, learnt=uneven))
-    words = ("selftraining.rounds=1", "selftraining.use_source=true")
-    cfg = toy(*ONLY_ROUNDS, *words, f"weights={tmp_path / 'teacher.pt'}")
-    metrics = train(cfg)
-    chosen = [metrics.rounds[-1].selected[name] + 1 for name in result.classes]
-    both = [(one / sum(chosen) + 1 / 3) / 2 for one in chosen]  # the toy source is even, but for
-    learnt = read_result(hashing.run_folder(cfg)).learnt  # clouds that validate
-    assert learnt == pytest.approx(both, abs=0.02)
-
-
 def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
     words = (*ONLY_ROUNDS, f"weights={finished}")
     whole = toy(*words)
@@ -94,7 +80,7 @@ def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words", "error", "message"),
     [
-        ({}, ("data.scale=metres", "data.source.unit=metres"), ConfigError, "data.scale=unit_ball"),
+        ({}, ("data.scale=metres", "data.source.unit=metres"), ConfigError, "data.scale"),
         ({"classes": ("rod", "ball", "slab")}, (), DataError, "rod, ball, slab"),
         ({"model": {"_target_": "tests.x.Y", "num_classes": 3}}, (), ConfigError, "tests.x.Y"),
         ({"more": 5}, (), ConfigError, "model.more=5"),

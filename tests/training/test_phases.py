@@ -111,23 +111,6 @@ def test_continued_students_begin_with_their_teacher(continued: Kept) -> None:
     assert not same(selected, continued.net(3))
 
 
-@pytest.mark.slow
-def test_target_norms_go_on_from_the_source_s(tmp_path: Path, toy_data: Path) -> None:
-    """For a teacher that never saw the target, by its batches: the source's statistics count."""
-    net = "model._target_=tests.training.nets.domained"
-    settings = ("selftraining=spst", "selftraining.theta=0.35", "selftraining.rounds=1", net)
-    run = kept_run(tmp_path, toy_data, "method=source_only", *settings)
-    selected, first = load(run.folder / "warmup_selected.pt"), run.before(4)["weights"]
-    assert int(selected["norm.target.num_batches_tracked"]) == 0
-    assert not torch.equal(selected["norm.source.running_mean"], torch.zeros(16))
-    assert int(first["norm.target.num_batches_tracked"]) == 0  # until a pass
-    for name, value in selected.items():
-        if name == "norm.target.num_batches_tracked":
-            continue
-        assert torch.equal(first[name], selected[name.replace("target", "source")]), name
-        assert "target" in name or torch.equal(first[name], value)
-
-
 def test_a_persistent_student_is_new_in_round_0_and_kept_afterwards(persistent: Kept) -> None:
     """The released code's: the same weights and moments in all rounds."""
     torch.manual_seed(derive(0, "init", 1))

@@ -19,7 +19,6 @@ import qs3.training.command
 import qs3.utils.threads
 from qs3.config import hashing
 from qs3.engine.classifier import Classifier
-from qs3.errors import DataError
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
@@ -126,30 +125,6 @@ def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, cal
             train(cfg)
     train(cfg)
     assert result_of(hashing.run_folder(cfg)) == result_of(finished)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        (
-            "round_00/pseudo_labels.csv",
-            "id,label,confidence,selected\nx,ball,0.5,1\n",
-            "called 'x'",
-        ),
-        slow("round_00/pseudo_labels.csv", "id,label\n", "it has other columns"),
-        slow("round_00/pseudo_labels.csv", "", "not enough values"),
-        ("history.csv", "a,b\n1,2\n", "delete it, and the same command goes on"),
-        slow("history.csv", "epoch\nfive\n", "delete it, and the same command goes on"),
-    ],
-)
-def test_damaged_tables_are_named(toy, name, text, message):
-    """As if it had been killed two epochs before its end, and its tables damaged since."""
-    cfg = toy()
-    interrupt(cfg, "on_train_epoch_start", 9)
-    (hashing.run_folder(cfg) / name).write_text(text)
-    with pytest.raises(DataError, match=rf"{name} is damaged \(.*{message}"):
-        train(cfg)
 
 
 def test_sigterm_is_status_143_also_in_a_worker_of_a_sweep(toy, monkeypatch):

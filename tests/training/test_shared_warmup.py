@@ -141,18 +141,6 @@ def test_nobody_elses_is_taken(tmp_path, different, caplog):
     assert mine.take() is False
 
 
-def test_without_its_mark_it_is_half_a_copy_and_replaced(tmp_path, caplog):
-    (tmp_path / "b").mkdir()
-    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", tmp_path / "w", SHA256, 7, 2), epochs=2)
-    (mark,) = (tmp_path / "w").rglob("started.json")
-    mark.unlink()
-    mine = SharedWarmup(tmp_path / "b", tmp_path / "w", SHA256, 7, 2)
-    assert not mine.take()
-    assert "damaged" not in caplog.text
-    trained(tmp_path / "b", mine, epochs=2)
-    assert mark.is_file()
-
-
 def started(folder: Path) -> Path:
     """The folder of a run that is one epoch away from its warm-up's end; no two are alike."""
     folder.mkdir()
