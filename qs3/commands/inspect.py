@@ -17,16 +17,14 @@ def inspect(
     data_dir: Annotated[str | None, "where datasets lie, paths.data_dir of a run"] = None,
     sample: Annotated[int, Ge(1), "clouds measured one by one; of more, some are drawn"] = 3000,
     seed: Annotated[int, Ge(0), "of all random draws"] = 0,
-    sheets: Annotated[int, Ge(0), "clouds of each class on its sheet; 0: no sheets"] = 48,
     out: Annotated[Path | None, "where text and pictures go (out/inspection/NAME)"] = None,
     **overrides: Annotated[str, "of the domain's config, e.g. published.folder=PATH"],
 ) -> None:
     """What a dataset is like, before training on it.
 
     What it is made of, counts by class and split, sizes, spacing, density, coverage, copies, leaks
-    from train to test, odd objects; a contact sheet of all classes and one of each
-    (sheets/CLASS.png, with tiers), and a page where clouds can be turned. Published files are
-    imported first.
+    from train to test, odd objects; a contact sheet of all classes and a page where clouds can be
+    turned. Published files are imported first.
 
     Examples:
         qs3 inspect modelnet10
@@ -35,7 +33,7 @@ def inspect(
     """
     from qs3.report.datasets import chosen, open_named, part_of
     from qs3.report.inspection import domain_text, measured
-    from qs3.report.sheets import class_sheet, sheets_by_class
+    from qs3.report.sheets import class_sheet
     from qs3.report.viewer import page
     from qs3.utils.files import make_folder, write_text
     from qs3.utils.pictures import save_png
@@ -50,10 +48,6 @@ def inspect(
     save_png(class_sheet(data, split, heading), folder / "clouds.png", colours=256)
     part = part_of(opened, chosen(data, _TURNABLE), False)
     write_text(folder / "clouds.html", page(opened.label, [part]))
-    if sheets:
-        metres = opened.unit == "m"
-        place = make_folder(folder / "sheets")
-        sheets_by_class(data, opened.kept, place, split, sheets, metres, heading, seed)
     print(f"{text}\n\nsaved text, table, pictures and clouds.html in {folder}")
 
 
@@ -63,7 +57,6 @@ def compare(
     *,
     data_dir: Annotated[str | None, "where datasets lie, paths.data_dir of a run"] = None,
     seed: Annotated[int, Ge(0), "of all random draws"] = 0,
-    meshes: Annotated[Path | None, "folder of meshes that they were generated from"] = None,
     out: Annotated[Path | None, "where text and picture go (out/inspection/A-B)"] = None,
     **overrides: Annotated[str, "of both domains' configs; a.KEY and b.KEY of one"],
 ) -> None:
@@ -89,7 +82,7 @@ def compare(
     for side, name, other in (("a.", a, "b."), ("b.", b, "a.")):
         own = {k.removeprefix(side): v for k, v in overrides.items() if not k.startswith(other)}
         sides.append(open_named(name, _with(data_dir, own)))
-    facts = measure(sides[0], sides[1], seed, meshes)
+    facts = measure(sides[0], sides[1], seed)
     text, names = pair_text(facts), [_name(one.name, one.variant) for one in sides]
     folder = make_folder(out or _OUT / "-".join(names))
     write_json(folder / "comparison.json", facts)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import sys
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,14 +29,11 @@ REPORT = {
     "pipeline": "qs3.commands.report:pipeline",
 }
 
-_Name = Annotated[str, "name of a file in conf/table, or a file NAME.yaml"]
 _Logs = Annotated[str, "paths.log_dir of the runs"]
 _Data = Annotated[str | None, "paths.data_dir of the runs"]
-_Target = Annotated[str | None, "another target domain for all of the table"]
 _Overrides = Annotated[str, 'more settings "A=B ..." of all runs; COLUMN:A=B of a column\'s']
 _Kept = Annotated[Path | None, "results that `qs3 report keep` has kept: shown, not trained"]
 _Columns = Annotated[tuple[str, ...], "only columns of this name, or with it in theirs"]
-_Rows = Annotated[tuple[str, ...], "only rows of this name, or with it in theirs"]
 _Out = Annotated[str | None, "where the files go (default LOG_DIR/tables)"]
 _Seeds = Annotated[tuple[Annotated[int, Ge(0)], ...], "of each cell (default: the table's)"]
 _Jobs = Annotated[int | None, Ge(1), "runs at the same time"]
@@ -42,13 +41,14 @@ _Launcher = Literal["basic", "joblib", "ray", "slurm", "submitit_local", "submit
 
 
 def _built(
-    table: str,
-    log_dir: str,
-    data_dir: str | None,
-    target: str | None,
-    overrides: str,
-    kept: Path | None,
-    columns: tuple[str, ...] = (),
+    *,
+    table: Annotated[str, "name of a file in conf/table, or a file NAME.yaml"],
+    log_dir: _Logs = "logs",
+    data_dir: _Data = None,
+    target: Annotated[str | None, "another target domain for all of the table"] = None,
+    overrides: _Overrides = "",
+    kept: _Kept = None,
+    columns: _Columns = (),
     **more: Any,
 ) -> Table:
     import shlex
@@ -61,28 +61,33 @@ def _built(
     return build_table(table, log_dir, extra, target, kept, columns=columns, **more)
 
 
-def _place(name: str, out: str | None, log_dir: str, *more: str | None) -> Path:
+def _of_table(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command with the keys of `_built` and its own, which is called with the built table."""
+    shared = list(inspect.signature(_built).parameters.values())[:-1]
+    own = list(inspect.signature(command).parameters.values())[1:]
+
+    @functools.wraps(command)
+    def wrapped(**given: Any) -> Any:
+        found = _built(**{key.name: given.pop(key.name) for key in shared})
+        return command(found, **given)
+
+    keys = [*shared, *own]
+    wrapped.__signature__ = inspect.Signature(keys)  # type: ignore[attr-defined]
+    wrapped.__annotations__ = {key.name: key.annotation for key in keys}
+    return wrapped
+
+
+def _place(table: Table, out: str | None, *more: str) -> Path:
     """Where a table's files go, without suffix."""
-    import re
-
-    parts = (re.sub(r"[^\w.]+", "-", part).strip("-.") for part in (name, *more) if part)
-    return Path(out or Path(log_dir) / "tables") / "-".join(parts)
+    return Path(out or Path(table.log_dir) / "tables") / "-".join((table.file_name, *more))
 
 
-def table(
-    *,
-    table: _Name,
-    log_dir: _Logs = "logs",
-    data_dir: _Data = None,
-    target: _Target = None,
-    overrides: _Overrides = "",
-    kept: _Kept = None,
-    columns: _Columns = (),
-    out: _Out = None,
-) -> None:
+@_of_table
+def table(found: Table, *, out: _Out = None) -> None:
     """Print a table of runs, and save it as .md, .csv and .tex.
 
-    `qs3 report table=NAME` is short for `qs3 report table table=NAME`.
+    `qs3 report table=NAME` is short for `qs3 report table table=NAME`. The saved files also have
+    what the runs were measured on, and the commands that fill empty cells.
 
     Example:
         qs3 report table=uda
@@ -90,26 +95,19 @@ def table(
         qs3 report table=leaderboard columns="S -> K"
         qs3 report table=uda target=kinectsim10 overrides="trainer=gpu data.points=512"
     """
-    from qs3.report.tables.formats import csv_text, latex, markdown, save
+    from qs3.report.tables.formats import csv_text, latex, markdown, save, text
 
-    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
     texts = {".md": markdown(found), ".csv": csv_text(found), ".tex": latex(found)}
-    said = save(_place(found.name, out, log_dir, target, *columns), texts)
-    print(texts[".md"])
-    print(f"runs lie in {log_dir}; {said}")
+    said = save(_place(found, out), texts)
+    print(text(found), f"runs lie in {found.log_dir}; {said}", sep="\n")
 
 
+@_of_table
 def train(
+    found: Table,
     *,
-    table: _Name,
-    log_dir: _Logs = "logs",
-    data_dir: _Data = None,
-    target: _Target = None,
-    overrides: _Overrides = "",
-    kept: _Kept = None,
-    columns: _Columns = (),
     seeds: _Seeds = (),
-    rows: _Rows = (),
+    rows: Annotated[tuple[str, ...], "only rows of this name, or with it in theirs"] = (),
     jobs: _Jobs = None,
     launcher: Annotated[_Launcher | None, "of Hydra (default basic; joblib with jobs)"] = None,
     **settings: Annotated[str, "settings of the launcher, hydra.launcher.NAME"],
@@ -126,28 +124,19 @@ def train(
 
     if wrong := [key for key in settings if not key.lstrip("+").startswith("hydra.launcher.")]:
         raise ConfigError(f"unknown key {wrong[0]!r}")
-    found = _built(table, log_dir, data_dir, target, overrides, kept)
-    todo = missing(found, seeds, rows, columns)
+    todo = missing(found, seeds, rows)
     print(f"table {found.name}: {len(todo)} runs to do", flush=True)
     launcher = launcher or ("joblib" if (jobs or 1) > 1 else "basic")
     more = [f"{key}={value}" for key, value in settings.items()]
-    return launch(todo, launcher, jobs, log_dir, more)
+    return launch(todo, launcher, jobs, found.log_dir, more)
 
 
-def keep(
-    *,
-    table: _Name,
-    into: Annotated[Path, "the file, NAME.csv.gz"],
-    log_dir: _Logs = "logs",
-    data_dir: _Data = None,
-    target: _Target = None,
-    overrides: _Overrides = "",
-    kept: Annotated[Path | None, "a file whose runs are kept on, too"] = None,
-    columns: _Columns = (),
-) -> None:
+@_of_table
+def keep(found: Table, *, into: Annotated[Path, "the file, NAME.csv.gz"]) -> None:
     """Keep the results of a table's finished runs in one small file.
 
-    It holds what tables and paired intervals need, by row, column and seed.
+    It holds what tables and paired intervals need, by row, column and seed; with kept= also the
+    results of that file.
 
     Example:
         qs3 report keep table=real into=docs/results/real.csv.gz
@@ -156,22 +145,16 @@ def keep(
     from qs3.report.tables.results import write_kept
     from qs3.report.tables.table import kept_lines
 
-    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
     lines = kept_lines(found)
     write_kept(into, lines)
     print(f"kept {len(lines)} runs of table {found.name} in {into}")
 
 
+@_of_table
 def compare(
+    found: Table,
     *,
-    table: _Name,
     base: Annotated[str, "the row to compare with: its name, or a part of it"],
-    log_dir: _Logs = "logs",
-    data_dir: _Data = None,
-    target: _Target = None,
-    overrides: _Overrides = "",
-    kept: _Kept = None,
-    columns: _Columns = (),
     out: _Out = None,
 ) -> None:
     """Print the difference of each row to one row, with its interval.
@@ -185,24 +168,13 @@ def compare(
     """
     from qs3.report.tables.comparison import against, row_of
 
-    row = row_of(_built(table, log_dir, data_dir, target, overrides, None, runs=False), base)
-    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
-    place = _place(found.name, out, log_dir, target, *columns, "compared")
-    _save(place, found, against(found, row), row)
+    row = row_of(found, base)
+    _save(_place(found, out, "compared"), found, against(found, row), row)
 
 
-def effects(
-    *,
-    table: _Name,
-    log_dir: _Logs = "logs",
-    data_dir: _Data = None,
-    target: _Target = None,
-    overrides: _Overrides = "",
-    kept: _Kept = None,
-    columns: _Columns = (),
-    out: _Out = None,
-) -> None:
-    """Print differences between columns over all rows, of rows over columns, or of factors.
+@_of_table
+def effects(found: Table, *, out: _Out = None) -> None:
+    """Print the effects of the factors that a table's rows cross.
 
     Paired, with intervals, as of `qs3 report compare`.
 
@@ -211,31 +183,23 @@ def effects(
     """
     from qs3.report.tables import comparison
 
-    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
-    place = _place(found.name, out, log_dir, target, *columns, "effects")
-    _save(place, found, comparison.effects(found))
+    _save(_place(found, out, "effects"), found, comparison.effects(found))
 
 
 def _save(place: Path, table: Table, found: list[Compared], base: str = "") -> None:
-    from qs3.report.tables.comparison import csv_text, text
+    from qs3.report.tables.comparison import text
     from qs3.report.tables.formats import save
 
-    page = text(found, base, markdown=True, table=table)
-    said = save(place, {".md": page, ".csv": csv_text(found, base)})
-    print(text(found, base, table=table))
-    print(said)
+    said = save(place, {".md": text(found, base, markdown=True, table=table)})
+    print(text(found, base, table=table), said, sep="\n")
 
 
 def judge(
     *,
     runs: Annotated[tuple[str, ...], "folders of runs, or of seeds, or patterns"],
     data: Annotated[Path, "the archive, .npz"],
-    classes: Annotated[tuple[str, ...], "only objects of these (default: all)"] = (),
     part: Annotated[str, "part of the archive (default: judge, if it has one)"] = "",
-    inliers_only: Annotated[bool, "leave out points that the archive marks as stray"] = True,
     floor: Annotated[float | None, "its z in metres, minus the camera's height"] = None,
-    prior: Annotated[str, "also with classes as common: rooms or C:N,C:N; see qs3 predict"] = "",
-    prior_power: Annotated[float, Ge(0), "how much of that is believed: 0 none, 1 all"] = 0.5,
     device: Annotated[str, "cpu, cuda or cuda:1"] = "cpu",
     out: Annotated[Path | None, "a CSV file, with all digits"] = None,
 ) -> None:
@@ -249,18 +213,15 @@ def judge(
 
     Example:
         qs3 report judge runs=logs/source_only_s2d,logs/qs3_s2d data=held_back.npz out=judged.csv
-        qs3 report judge runs=dgcnn-rooms data=held_back.npz floor=-1.2 prior=rooms
+        qs3 report judge runs=dgcnn-rooms data=held_back.npz floor=-1.2
     """
     from qs3.report import judge as judging
     from qs3.utils.files import write_text
 
-    verdict = judging.judge(
-        runs, data, classes=classes, part=part, inliers_only=inliers_only, floor=floor,
-        device=device, prior=prior, prior_power=prior_power,
-    )  # fmt: skip
+    verdict = judging.judge(runs, data, part=part, floor=floor, device=device)
     print(judging.text(verdict))
     if out:
-        write_text(out, judging.csv_text(verdict))
+        write_text(out, verdict.figures.to_csv(index=False, lineterminator="\n"))
         print(f"saved {out}")
 
 
@@ -300,16 +261,19 @@ def leaderboard(
         raise ConfigError(f"unknown key {wrong[0]!r}")
     words = [f"{key}={value}" for key, value in settings.items()]
     row = own_row(method, name, selftraining, words)
-    given = (table, log_dir, data_dir, None, overrides, kept, columns)
-    check_row(_built(*given, rows=[row], runs=False), row["name"])
-    todo = missing(_built(*given, rows=[row]), seeds, [row["name"]], columns)
+    build = functools.partial(
+        _built, table=table, log_dir=log_dir, data_dir=data_dir, overrides=overrides, kept=kept,
+        columns=columns, rows=[row],
+    )  # fmt: skip
+    check_row(build(runs=False), row["name"])
+    todo = missing(build(), seeds, [row["name"]])
     print(f"{row['name']}: {len(todo)} runs to do", flush=True)
     status = launch(todo, "joblib" if (jobs or 1) > 1 else "basic", jobs, log_dir)
-    found = first_row(_built(*given, rows=[row]), row["name"])
+    found = first_row(build(), row["name"])
     text = page(found, row["name"])
-    place = _place(found.name, out, log_dir, row["name"], *columns)
+    place = _place(found, out, "".join(c if c.isalnum() else "-" for c in row["name"]))
     said = save(place, {".md": text, ".csv": csv_text(found), ".tex": latex(found)})
-    print(f"{text}\n{said}", file=sys.stdout)
+    print(text, said, sep="\n")
     return status
 
 
@@ -338,41 +302,20 @@ def pictures(
     domains: Annotated[tuple[str, ...], "names of conf/domain"],
     data_dir: Annotated[Path, "where the datasets lie"] = Path("data"),
     split: Annotated[str, "whose clouds"] = "train",
-    out: Annotated[Path | None, "a folder, or one .png of all (default DATA_DIR/pictures)"] = None,
+    out: Annotated[Path, "the picture"] = Path("domains.png"),
 ) -> None:
-    """Contact sheets of domains: each one's clouds, and one object of each class.
+    """One object of each class as each of several domains has it, as a picture.
 
     Example:
         qs3 report pictures domains=modelnet10,specklenet10,kinectsim10
     """
     from qs3.datasets.domain import compose_domain
-    from qs3.report.sheets import class_sheet, scan_picture
+    from qs3.report.sheets import scan_picture
     from qs3.utils.pictures import save_png
 
     found = [compose_domain(name, {"paths.data_dir": str(data_dir)}) for name in domains]
-    data = {domain.name: domain.open() for domain in found}
-    columns = {
-        f"{one.symbol}: {one.title}{' (simulated)' * one.simulated}": data[one.name]
-        for one in found
-    }
-    figure = scan_picture(columns, split)
-    folder = out or data_dir / "pictures"
-    figures = (
-        {folder: figure}
-        if folder.suffix == ".png"
-        else {
-            folder / "domains.png": figure,
-            **{
-                folder / f"{one.name}.png": class_sheet(
-                    data[one.name], split, f"{one.label}, {split}"
-                )
-                for one in found
-            },
-        }
-    )
-    for path, one in figures.items():
-        save_png(one, path, colours=256)
-        print(path)
+    save_png(scan_picture({one.label: one.open() for one in found}, split), out, colours=256)
+    print(out)
 
 
 def pipeline(

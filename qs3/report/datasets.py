@@ -14,9 +14,8 @@ from scipy.spatial import cKDTree
 from qs3.catalogue import Catalogue
 from qs3.config.compose import choices
 from qs3.datasets.domain import Domain, compose_domain
-from qs3.errors import ConfigError, Qs3Error
+from qs3.errors import ConfigError
 from qs3.geometry.sampling import surface_sample
-from qs3.meshes.folder import MeshFolder
 from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.meshes.placement import OnFurniture, Placing, RealSize, UnitCube
 from qs3.report.sheets import drawn
@@ -111,51 +110,22 @@ class Surfaces:
     def mesh(self, row: ManifestRow) -> Mesh | None:
         """The object's placed mesh; None if it is not the one that was scanned."""
         item = self.items.get(row.id.split("~")[0])
-        if item is None:
-            return None
-        try:
-            mesh = item.load()
-        except Qs3Error:
-            return None
-        if mesh.sha256 != row.mesh_sha256:
+        if item is None or (mesh := item.load()).sha256 != row.mesh_sha256:
             return None
         return self.placing.place(mesh, object_rng(self.seed, row.id, 0), row.id)
 
 
-def surfaces_of(meta: Mapping[str, Any], meshes: Path | None = None) -> tuple[Surfaces | None, str]:
-    """The surfaces of a store by its `meta`, or None and why they are not known.
-
-    A generated store knows its meshes, its seed and its placing. `meshes` is the folder that it
-    was made from, if it was not the embedded catalogue.
-    """
-    settings = meta.get("settings")
-    if not isinstance(settings, dict):
-        return None, "the dataset was not generated here, so its meshes are not known"
-    recipe = settings.get("recipe") or {}
+def surfaces_of(meta: Mapping[str, Any]) -> Surfaces | None:
+    """The surfaces of a store that was generated from the embedded catalogue, by its `meta`."""
+    settings = meta.get("settings") or {}
+    recipe, source = settings.get("recipe") or {}, settings.get("meshes")
     placing = dict(recipe.get("placing") or {"_target_": next(iter(_PLACINGS))})
     make = _PLACINGS.get(placing.pop("_target_", ""))
-    if recipe.get("poses") or make is None:
-        return None, "the objects were placed by a file of poses, or in another way"
-    source = settings.get("meshes")
-    if source == "folder":
-        if meshes is None:
-            return None, "it was made from a folder of meshes: give it with meshes=PATH"
-        config = meta.get("config") or {}
-        keys = {key: config[key] for key in ("test_fraction", "half") if key in config}
-        items = MeshFolder(
-            path=meshes,
-            keep_colliders=settings["colliders"] == "keep",
-            up=settings["up"],
-            classes=config.get("classes") or None,
-            known=tuple(meta["classes"]),
-            **keys,
-        ).items()
-    elif isinstance(source, dict) and source.get("_target_") == _CATALOGUE:
-        values = {key: value for key, value in source.items() if key != "_target_"}
-        items = Catalogue(**values).items()
-    else:
-        return None, "it was made from another catalogue"
-    return Surfaces(int(settings["seed"]), make(**placing), {item.id: item for item in items}), ""
+    values = dict(source) if isinstance(source, dict) else {}
+    if make is None or recipe.get("poses") or values.pop("_target_", "") != _CATALOGUE:
+        return None
+    items = {item.id: item for item in Catalogue(**values).items()}
+    return Surfaces(int(settings["seed"]), make(**placing), items)
 
 
 def distance_to_mesh(points: Float[np.ndarray, "p 3"], mesh: Mesh) -> Float[np.ndarray, " p"]:
@@ -220,7 +190,7 @@ def part_of(opened: Opened, positions: Sequence[int], residuals: bool = True) ->
 
     surfaces, twin, words = None, None, "error of the depth that the sensor measured"
     if _RESIDUAL not in names and residuals:
-        surfaces, twin = surfaces_of(data.meta)[0], opened.twin
+        surfaces, twin = surfaces_of(data.meta), opened.twin
         words = "distance to the mesh" if surfaces else "distance to the clean twin's nearest point"
     shown = []
     with progress_bar("clouds", total=len(positions)) as advance:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -205,13 +204,12 @@ def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def compare(a: Opened, b: Opened, seed: int = 0, meshes: Path | None = None) -> dict[str, Any]:
+def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
     """The gap between two datasets.
 
     Args:
         a, b: the datasets.
         seed: of all draws.
-        meshes: the folder that they were generated from, if it was one.
 
     Raises:
         ConfigError: they have no class in common.
@@ -227,7 +225,7 @@ def compare(a: Opened, b: Opened, seed: int = 0, meshes: Path | None = None) -> 
         labels.append(np.repeat(np.arange(len(common)), [len(of) for of in chosen]))
         clouds.append([_sampled(one.data.points[i], count) for i in np.concatenate(chosen)])
         values.append(pd.DataFrame([one_cloud(cloud) for cloud in clouds[-1]]))
-        surfaces.append(surface(one, common, seed, meshes))
+        surfaces.append(surface(one, common, seed))
     shares = [pd.Series({cls: len(one.data.members(cls)) for cls in one.data.classes})
               for one in both]  # fmt: skip
     prior = pd.DataFrame({"A": shares[0], "B": shares[1]}).fillna(0)
@@ -246,16 +244,14 @@ def compare(a: Opened, b: Opened, seed: int = 0, meshes: Path | None = None) -> 
     }  # fmt: skip
 
 
-def surface(
-    opened: Opened, classes: Sequence[str], seed: int = 0, meshes: Path | None = None
-) -> dict[str, Any]:
+def surface(opened: Opened, classes: Sequence[str], seed: int = 0) -> dict[str, Any]:
     """How far points lie from the true surface and how much of it was measured.
 
     The truth is the placed mesh; where that is not known, the clean twin, whose own spacing is
-    then part of every distance; where there is none, only a reason is given. Distances are as
+    then part of every distance; where there is none, the truth is unknown. Distances are as
     stored, and in units of the unit ball; the measured share is the mean over the classes.
     """
-    surfaces, reason = surfaces_of(opened.data.meta, meshes)
+    surfaces = surfaces_of(opened.data.meta)
     twin = opened.twin if surfaces is None else None
     rng = np.random.default_rng([seed, 1])
     kept = opened.kept
@@ -280,8 +276,7 @@ def surface(
             seen.append((cKDTree(cloud).query(truth)[0] < WITHIN * radius).mean())
         shares += [np.mean(seen)] if seen else []
     if not off:
-        reason = reason or "the meshes are not the ones that were scanned"
-        return {"truth": "unknown", "reason": reason}
+        return {"truth": "unknown"}
     median, p95 = np.percentile([np.concatenate(off), np.concatenate(relative)], [50, 95], axis=1)
     return {
         "truth": "clean twin" if surfaces is None else "mesh",

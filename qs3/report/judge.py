@@ -8,8 +8,8 @@ run was trained with. Nothing is trained, chosen or tuned by what comes out.
 from __future__ import annotations
 
 import glob
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import pandas as pd
 from jaxtyping import Int
 
 from qs3.classes import known_as
-from qs3.datasets.object_archive import JUDGE, TIERS, Archive, read_archive
+from qs3.datasets.object_archive import JUDGE, TIERS, read_archive
 from qs3.errors import ConfigError, MissingDataError
 from qs3.inference.model_file import FILE, find_result, pretrained_name
 from qs3.inference.predictor import Predictor, load
@@ -26,7 +26,6 @@ from qs3.report.intervals import Interval, difference, share
 from qs3.runs.metrics import read_metrics
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import aligned
-from qs3.utils.version import VERSION, commit, in_words
 
 BLOCK = 30
 """Frames in a row that make a cluster."""
@@ -41,16 +40,12 @@ class Family:
         runs: their result files.
         seeds: theirs; empty where not known.
         data: what both domains are made of; "" where not known.
-        trained_by: versions of qs3, and commits if it was a checkout; "" where not known.
-        prior: how common classes counted as; "": as in training.
     """
 
     name: str
     runs: tuple[Path, ...]
     seeds: tuple[int, ...] = ()
     data: str = ""
-    trained_by: str = ""
-    prior: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,7 +62,7 @@ class Verdict:
             majority (what always naming the commonest class would reach);
             recall_CLASS, objects_CLASS;
             alone (classes whose objects are all of one block: with them the interval of the
-            balanced accuracy is too narrow); data, trained_by, judged_by.
+            balanced accuracy is too narrow); data.
     """
 
     about: str
@@ -79,25 +74,20 @@ def judge(
     runs: Sequence[str],
     data: Path,
     *,
-    classes: Sequence[str] = (),
     part: str = "",
-    inliers_only: bool = True,
     floor: float | None = None,
     device: str = "cpu",
-    prior: str = "",
-    prior_power: float = 0.5,
 ) -> Verdict:
-    """Judge saved runs on an archive of objects.
+    """Judge saved runs on an archive's objects of the classes that every run knows.
+
+    Points that the archive marks as stray are left out.
 
     Args:
         runs: folders of runs, folders of such folders, patterns, or result files.
         data: the .npz.
-        classes: only objects of these; none: of all that every run knows.
         part: of its `dev`; none: "judge", where it has one, else all.
-        inliers_only: leave points out that the archive marks as stray.
         floor: z of the floor in the archive, minus its camera's height, for nets that know heights.
         device: of the nets.
-        prior, prior_power: see `qs3.evaluation.prior`: each family is judged without and with it.
 
     Raises:
         ConfigError: nothing is left to judge on, or runs cannot be judged so.
@@ -106,80 +96,51 @@ def judge(
     part = part or (JUDGE if JUDGE in archive.parts else "")
     chosen = archive.of_part(part) if part else list(range(len(archive)))
     families = _families(find_runs(runs))
-    nets = {
-        (file, one): _load(file, one, prior_power, floor, device)
-        for one in ("", prior)[: 1 + bool(prior)]
-        for family in families
-        for file in family.runs
-    }
+    nets = {file: _load(file, floor, device) for family in families for file in family.runs}
     first = next(iter(nets.values())).classes
     common = tuple(name for name in first if all(name in net.classes for net in nets.values()))
-    if unknown := {*classes} - {*common}:
-        raise ConfigError(f"classes: {', '.join(sorted(unknown))} is not known to every run")
-    common = tuple(name for name in common if not classes or name in classes)
     names = [known_as(str(name), common) for name in archive.cls]
     kept = [i for i in chosen if names[i] is not None]
     if not kept:
         raise ConfigError(f"{data} has no objects of {', '.join(common)} in what was asked for")
-    called = _called(nets, archive, kept, common, inliers_only, floor)
-    if prior:
-        families += [replace(f, name=f"{f.name}, prior={prior}", prior=prior) for f in families]
+    clouds = [archive.cloud(i, inliers_only=True) for i in kept]
+    shown = [f"{data.name}[{i}]" for i in kept]
+    called = {}
+    with progress_bar("judging runs", total=len(nets)) as advance:
+        for file, net in nets.items():
+            place = [common.index(name) if name in common else -1 for name in net.classes]
+            called[file] = np.array(place)[net(clouds, names=shown, floor=floor).argmax(axis=1)]
+            advance()
     truth = np.array([common.index(str(names[i])) for i in kept])
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
     subsets = {"all": np.ones(len(kept), dtype=bool)}
     subsets |= {tier: tiers == tier for tier in TIERS if (tiers == tier).any()}
     rows = []
-    guesses = [np.stack([called[file, f.prior] for file in f.runs]) for f in families]
+    guesses = [np.stack([called[file] for file in f.runs]) for f in families]
     for family, guess in zip(families, guesses, strict=True):
         a, b = _paired(family, guess == truth, families[0], guesses[0] == truth)
         for tier, of in subsets.items():
-            row: dict[str, Any] = {
-                "run": family.name,
-                "seeds": " ".join(map(str, family.seeds)),
-                "tier": tier,
-            }
+            seeds = " ".join(map(str, family.seeds))
+            row: dict[str, Any] = {"run": family.name, "seeds": seeds, "tier": tier}
             row |= _figures(guess[:, of], truth[of], blocks[of], common)
             if family is not families[0]:
-                for name, balanced in (("accuracy_more", False), ("balanced_more", True)):
-                    less = (a - b)[:, of]
-                    row |= _ends(name, difference(less, truth[of], blocks[of], balanced=balanced))
-            made = {"data": family.data, "trained_by": family.trained_by}
-            rows.append({**row, **made, "judged_by": in_words(VERSION, commit())})
-    stray = "left out" if inliers_only else "kept"
-    lies = "" if floor is None else f"; the floor lies at {floor:g} m"
+                some = ((a - b)[:, of], truth[of], blocks[of])
+                row |= _ends("accuracy_more", difference(*some))
+                row |= _ends("balanced_more", difference(*some, balanced=True))
+            rows.append({**row, "data": family.data})
     others = len(chosen) - len(kept)
-    about = f"{data}{f', part {part}' * bool(part)}: real objects; stray points {stray}{lies}; "
+    about = f"{data}{f', part {part}' * bool(part)}: real objects without stray points; "
     return Verdict(f"{about}{others} objects of other classes left out", common, pd.DataFrame(rows))
 
 
-def _load(file: Path, prior: str, power: float, floor: float | None, device: str) -> Predictor:
+def _load(file: Path, floor: float | None, device: str) -> Predictor:
     """The classifier of a run, for clouds with z up and, if it knows heights, a known floor."""
-    net = load(file, device=device, prior=prior or None, prior_power=power)
+    net = load(file, device=device)
     if net.result.gravity != "z":
         raise ConfigError(f"{file} was trained on clouds in the frame of their camera, not z up")
     if net.needs_floor and net.camera_height is None and floor is None:
         raise ConfigError(f"{file} knows heights above the floor; give floor=-CAMERA_HEIGHT")
     return net
-
-
-def _called(
-    nets: Mapping[tuple[Path, str], Predictor],
-    archive: Archive,
-    kept: Sequence[int],
-    common: Sequence[str],
-    inliers_only: bool,
-    floor: float | None,
-) -> dict[tuple[Path, str], np.ndarray]:
-    """A position in `common` for each object by each net, or -1 for another class."""
-    clouds = [archive.cloud(i, inliers_only) for i in kept]
-    names = [f"{archive.path.name}[{i}]" for i in kept]
-    found = {}
-    with progress_bar("judging runs", total=len(nets)) as advance:
-        for key, net in nets.items():
-            place = [common.index(name) if name in common else -1 for name in net.classes]
-            found[key] = np.array(place)[net(clouds, names=names, floor=floor).argmax(axis=1)]
-            advance()
-    return found
 
 
 def find_runs(runs: Sequence[str]) -> list[Path]:
@@ -222,9 +183,7 @@ def _families(files: Sequence[Path]) -> list[Family]:
         if (first := results[0]) is None:
             found.append(Family(pretrained_name(runs[0]) or str(runs[0]), runs))
             continue
-        by = {in_words(m.versions.get("qs3", "?"), m.versions.get("commit", "")) for m in results}
-        name = f"{first.experiment} {first.hash}"
-        found.append(Family(name, runs, seeds, first.data_text, "; ".join(sorted(by))))
+        found.append(Family(f"{first.experiment} {first.hash}", runs, seeds, first.data_text))
     return found
 
 
@@ -293,19 +252,12 @@ def text(verdict: Verdict) -> str:
             "narrow"
         )
     every = figures[figures.tier == "all"]
-    for key, words in (("data", "data of"), ("trained_by", "trained by,")):
-        lines += [f"{words} {f.run}: {f[key]}" for _, f in every.iterrows() if f[key]]
-    lines.append(f"judged by {every.judged_by.iloc[0]}")
+    lines += [f"data of {f.run}: {f['data']}" for _, f in every.iterrows() if f["data"]]
     classes = [["class", *mine.tier, *every.run]]
     for name in (name for name in verdict.classes if every[f"objects_{name}"].iloc[0]):
         counts = [str(count) for count in mine[f"objects_{name}"]]
         classes.append([name, *counts, *(f"{100 * r:.0f}" for r in every[f"recall_{name}"])])
     return "\n".join([*lines, "", "recall %", *aligned(classes, numbers=True)])
-
-
-def csv_text(verdict: Verdict) -> str:
-    """`Verdict.figures` with all digits."""
-    return str(verdict.figures.to_csv(index=False, lineterminator="\n"))
 
 
 def _percent(figures: pd.Series, name: str) -> str:

@@ -138,39 +138,20 @@ def pseudo_labels(run: RunFiles) -> pd.DataFrame:
     And what they are worth: precision and recall know the target's labels, which judge alone.
     """
     columns = {}
-    for one in run.rounds:
-        record, judged = one.record, getattr(one.record, "with_target_labels", None)
-        kept = "thresholds" if getattr(record, "mu", None) is None else "mu"
-        cells = zip(*(one.counts(run.classes, key) for key in ("selected", "confident", kept)),
-                    strict=True)  # fmt: skip
-        words = [f"{n:.0f}/{m:.0f}, {kept} {k:.2f}" if record else f"{n:.0f}" for n, m, k in cells]
-        shares = {
-            "theta": getattr(record, "theta", None),
-            "same label as before": getattr(record, "agreement", None),
-            "precision (evaluation only)": getattr(judged, "precision", None),
-            "recall (evaluation only)": getattr(judged, "recall", None),
-        }
-        known = {name: share for name, share in shares.items() if share is not None}
-        columns[f"round {one.number}"] = dict(zip(run.classes, words, strict=True)) | known
+    for one in run.metrics.rounds if run.metrics else ():
+        kept, by_class = ("thresholds", one.thresholds) if one.mu is None else ("mu", one.mu)
+        column: dict[str, Any] = {}
+        for name in run.classes:
+            share = f", {kept} {by_class[name]:.2f}" if by_class and name in by_class else ""
+            column[name] = f"{one.selected.get(name, 0)}/{one.confident.get(name, 0)}{share}"
+        column["theta"] = one.theta
+        if one.agreement is not None:
+            column["same label as before"] = one.agreement
+        if judged := one.with_target_labels:
+            column["precision (evaluation only)"] = judged.precision
+            column["recall (evaluation only)"] = judged.recall
+        columns[f"round {one.round}"] = column
     return pd.DataFrame(columns)
-
-
-def class_counts(run: RunFiles, train_labels: Int[np.ndarray, " n"] | None = None) -> pd.DataFrame:
-    """By class: clouds of the target, true ones to judge by, named, selected and predicted.
-
-    `train_labels` of its training clouds, if known, are shown and nothing else.
-    """
-    c, p = len(run.classes), run.predictions
-    columns = {}
-    if train_labels is not None:
-        columns["train, true (evaluation only)"] = np.bincount(train_labels, minlength=c)
-    if run.rounds:
-        columns["named by the last teacher"] = run.rounds[-1].counts(run.classes, "named")
-        columns["selected"] = run.rounds[-1].counts(run.classes, "selected")
-    if p is not None:
-        columns["true (evaluation only)"] = np.bincount(p.labels[p.labels >= 0], minlength=c)
-        columns["predicted"] = np.bincount(p.predicted, minlength=c)
-    return pd.DataFrame(columns, index=run.classes).dropna(axis=1).astype(int)
 
 
 def _figure(

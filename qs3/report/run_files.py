@@ -7,25 +7,17 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from jaxtyping import Float
-
 from qs3.datasets.domain import Domain
 from qs3.errors import DataError, MissingDataError
 from qs3.runs import folder as runs
-from qs3.runs.metrics import METRICS, RoundRecord, RunMetrics, read_metrics
+from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE as PREDICTIONS
-from qs3.runs.predictions import (
-    Predictions,
-    PseudoLabel,
-    read_predictions,
-    read_pseudo_labels,
-)
+from qs3.runs.predictions import Predictions, read_predictions
 from qs3.store.store import PointSet, is_finished
 
 if TYPE_CHECKING:
@@ -36,31 +28,6 @@ _DOMAIN = tuple(field.name for field in dataclasses.fields(Domain))
 
 
 @dataclass(frozen=True, eq=False)
-class Round:
-    """One round of self-training.
-
-    Attributes:
-        number: from 0.
-        record: of metrics.json; None in an unfinished run.
-        labels: its pseudo_labels.csv; None if that is gone.
-    """
-
-    number: int
-    record: RoundRecord | None
-    labels: list[PseudoLabel] | None
-
-    def counts(self, classes: Sequence[str], key: str) -> Float[np.ndarray, " c"]:
-        """By class: "named" by the teacher, "selected", "confident", "mu", "thresholds"; or NaN."""
-        if self.labels is not None and key in ("named", "selected"):
-            names = [row.label for row in self.labels if row.selected or key == "named"]
-            return np.array([float(names.count(name)) for name in classes])
-        values = getattr(self.record, key, None)
-        if values is None:
-            return np.full(len(classes), np.nan)
-        return np.array([float(values.get(name, 0)) for name in classes])
-
-
-@dataclass(frozen=True, eq=False)
 class RunFiles:
     """A run, read.
 
@@ -68,7 +35,6 @@ class RunFiles:
         folder: of the run.
         metrics: contents of metrics.json; None if the run is not finished.
         history: history.csv, one row an epoch; None if no epoch is done.
-        rounds: in order.
         predictions: None if there are none yet.
         classes: names in label order.
         config: as composed, not resolved; None if Hydra did not write it.
@@ -78,7 +44,6 @@ class RunFiles:
     folder: Path
     metrics: RunMetrics | None
     history: pd.DataFrame | None
-    rounds: tuple[Round, ...]
     predictions: Predictions | None
     classes: tuple[str, ...]
     config: Mapping[str, Any] | None
@@ -119,16 +84,7 @@ def read_run(folder: str | Path) -> RunFiles:
     metrics, predictions, history = read_metrics(folder), None, None
     if (folder / PREDICTIONS).is_file():
         predictions = read_predictions(folder / PREDICTIONS)
-    records = {record.round: record for record in (metrics.rounds if metrics else [])}
-    files = folder.glob("round_[0-9]*/pseudo_labels.csv")
-    tables = {int(path.parent.name[6:]): read_pseudo_labels(path) for path in files}
-    rounds = tuple(Round(n, records.get(n), tables.get(n)) for n in sorted({*records, *tables}))
-    if predictions is not None:
-        classes = predictions.classes
-    elif metrics is not None:
-        classes = tuple(metrics.final.predicted)
-    else:
-        classes = tuple(sorted({row.label for table in tables.values() for row in table}))
+    classes = tuple(metrics.final.predicted) if metrics else ()
     hydra: dict[str, Any] = dict.fromkeys(("config", "overrides"))
     try:
         if (folder / HISTORY).is_file():
@@ -141,9 +97,7 @@ def read_run(folder: str | Path) -> RunFiles:
         raise DataError(f"{folder}: {HISTORY} or .hydra is damaged ({error})") from error
     words = hydra["overrides"]
     command = None if words is None else shlex.join(["python", "train.py", *map(str, words)])
-    return RunFiles(
-        folder, metrics, history, rounds, predictions, classes, hydra["config"], command
-    )
+    return RunFiles(folder, metrics, history, predictions, classes, hydra["config"], command)
 
 
 def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> Domain:

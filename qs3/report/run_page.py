@@ -116,14 +116,11 @@ def draw(
         confusion=m
         and m.final.confusion
         and confusion_rows(np.array(m.final.confusion), run.classes),
-        tables={
-            heading: frame.to_html(border=0, float_format="{:.2f}".format, na_rep="")
-            for heading, frame in (
-                ("Pseudo-labels: selected / confident", run_charts.pseudo_labels(run)),
-                ("Clouds by class", run_charts.class_counts(run, _train_labels(run, data_dir))),
-            )
-            if len(frame.columns)
-        },
+        rounds=m
+        and m.rounds
+        and run_charts.pseudo_labels(run).to_html(
+            border=0, float_format="{:.2f}".format, na_rep=""
+        ),
         command=run.command,
         pictures=[(name, path.read_bytes()) for name, path in pictures.items()],
         skipped=skipped,
@@ -143,15 +140,6 @@ def _quality(metrics: RunMetrics) -> list[tuple[str, str]]:
         ("clouds unlike the labelled ones", f"{found.unlike_source:.1%}"),
         ("classes never predicted", ", ".join(found.never_predicted) or "none"),
     ]
-
-
-def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | None:
-    """[n] labels of the target's training split, if the run's dataset is there and has some."""
-    try:
-        data = open_domain(run, "target", data_dir)
-    except Qs3Error:
-        return None  # the picture is complete without them
-    return np.array(data.labels[data.indices("train")]) if data.labelled else None
 
 
 def _domains(run: RunFiles, data_dir: str | Path | None) -> Figure | str:
@@ -180,7 +168,7 @@ def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[st
     assert run.metrics is not None
     result, packages = read_result(run.folder), (*PACKAGES, *packages)
     nets = {"result": build_net(result, packages)}
-    if run.rounds and (run.folder / _WARMUP).is_file():
+    if run.metrics.rounds and (run.folder / _WARMUP).is_file():
         before = dataclasses.replace(result, weights=load(run.folder / _WARMUP))
         nets = {"after the warm-up": build_net(before, packages),
                 "after self-training": nets["result"]}  # fmt: skip
@@ -268,7 +256,7 @@ class AfterTraining:
 
     Attributes:
         pictures: False draws nothing, "auto" nothing in a sweep: they would take as long as many a
-            run, and the sweep draws its first run's (`of_sweep`).
+            run.
     """
 
     pictures: bool | Literal["auto"] = "auto"
@@ -291,46 +279,12 @@ class AfterTraining:
             )
 
 
-def of_sweep(folders: Sequence[Path]) -> str:
-    """Draw the first finished run's pictures, unless it has some.
-
-    Args:
-        folders: of the runs that left their pictures to the sweep, in order.
-
-    Returns:
-        A line with the page for the terminal; "" if no run is finished, or its pictures failed.
-    """
-    first = next((folder for folder in folders if read_metrics(folder) is not None), None)
-    if first is None:
-        return ""
-    path = first / FOLDER / PAGE
-    if not path.is_file():
-        AfterTraining(pictures=True)(first)
-    if not path.is_file():
-        return ""
-    more = "; of another run: qs3 report page run=PATH" if len(folders) > 1 else ""
-    return f"pictures: {path}{more}\n"
-
-
 def _log_to_wandb(drawn: Drawn, metrics: RunMetrics | None) -> None:
     wandb: Any = sys.modules.get("wandb")  # not imported: there is no such logger
     if wandb is None or wandb.run is None or metrics is None:
         return
-    content: dict[str, Any] = {
-        f"pictures/{name}": wandb.Image(str(path)) for name, path in drawn.pictures.items()
-    }
-    final = metrics.final
-    if final.confusion is not None:
-        names = list(final.predicted)
-        content["confusion"] = wandb.Table(
-            columns=["true class", *names],
-            data=[[name, *row] for name, row in zip(names, final.confusion, strict=True)],
-        )
-    wandb.run.log(content)
-    wandb.run.summary.update(
-        {
-            f"final/{key}": value
-            for key, value in vars(final).items()
-            if isinstance(value, int | float) and not isinstance(value, bool)
-        }
+    wandb.run.log(
+        {f"pictures/{name}": wandb.Image(str(path)) for name, path in drawn.pictures.items()}
     )
+    final = {key: value for key, value in vars(metrics.final).items() if isinstance(value, float)}
+    wandb.run.summary.update({f"final/{key}": value for key, value in final.items()})

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qs3.store.manifest import ManifestRow
 from qs3.store.store import PointSet
-from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, save_png, sheet, turn_deg
+from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, turn_deg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,52 +66,6 @@ def class_sheet(data: PointSet, split: str, heading: str = "") -> Figure:
         heading=heading,
         rows=rows,
     )
-
-
-def sheets_by_class(
-    data: PointSet,
-    rows: Sequence[ManifestRow],
-    folder: Path,
-    split: str,
-    most: int,
-    metres: bool,
-    heading: str,
-    seed: int = 0,
-) -> list[Path]:
-    """Save FOLDER/CLASS.png of each class that a split has; of unlabelled data all.png.
-
-    Below each cloud stand the end of its id, its tier if it has one, and its longest side.
-
-    Args:
-        data: the dataset.
-        rows: of its manifest, one a cloud.
-        folder: is made.
-        split: whose clouds.
-        most: clouds of a class; of more these are drawn at random.
-        metres: whether its unit is known.
-        heading: what is above, behind the class and its number of clouds.
-        seed: of the draw.
-    """
-    here = data.indices(split)
-    labels = data.labels[here]
-    members = {cls: here[labels == k] for k, cls in enumerate(data.classes)}
-    members = {cls: own for cls, own in members.items() if len(own)} or {"all": here}
-    saved: list[Path] = []
-    for number, (cls, own) in enumerate(members.items()):
-        positions = drawn(own, most, seed)
-        titles = []
-        for i in positions:
-            side = f"{np.ptp(data.points[i], axis=0).max():.2f} m" if metres else ""
-            words = ", ".join(filter(None, (rows[i].more.get("tier", ""), side)))
-            titles.append(f"{_short(data.ids[i])}\n{words}")
-        name = re.sub(r"[^\w-]+", "_", cls)[:60] or "_"
-        if name.lower() in {path.stem.lower() for path in saved}:
-            name += f"_{number}"
-        title = f"{cls}: {len(positions)} of {len(own)} of {heading}"
-        clouds = [data.points[i] for i in positions]
-        saved.append(folder / f"{name}.png")
-        save_png(contact_sheet(clouds, titles, 8, heading=title), saved[-1], colours=256)
-    return saved
 
 
 def scan_picture(domains: Mapping[str, PointSet], split: str = "train", note: str = "") -> Figure:

@@ -34,8 +34,6 @@ _NO_END = "did not end: killed, interrupted or still running; the same command g
 class SummaryOfSeeds(Callback):
     """After a multirun: mean and SEM over the seeds of each config, or objectives; what failed.
 
-    Also the pictures of its first run, unless `report.pictures` has each run draw its own or none.
-
     Jobs may run in other processes and on other machines (joblib, submitit), so what becomes of
     them is noted in a file next to the runs; its name travels to the jobs inside this object.
 
@@ -94,7 +92,6 @@ class SummaryOfSeeds(Callback):
             return
         hydra = config.hydra
         entry = {"folder": str(hydra.runtime.output_dir), "job": hydra.job.get("num", 0), **more}
-        entry["pictures"] = OmegaConf.select(config, "report.pictures")
         try:  # never made here: a job that ends after the summary leaves nothing behind
             handle = os.open(self.journal, os.O_WRONLY | os.O_APPEND)
         except FileNotFoundError:
@@ -115,7 +112,6 @@ class SummaryOfSeeds(Callback):
             from qs3.report.tables.results import summarise
 
             sys.stdout.write(summarise(folders, differences(jobs)) + "\n")
-        sys.stdout.write(_pictures(jobs))
         sys.stdout.write(failures(jobs))
         sys.stdout.flush()
 
@@ -162,17 +158,6 @@ def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
         Path(job["folder"]): " ".join(f"{key}={one[key]}" for key in several if key in one)
         for job, one in zip(jobs, words, strict=True)
     }
-
-
-def _pictures(jobs: Sequence[Mapping[str, Any]]) -> str:
-    """Draw them for the first run of those that left it to the sweep; a line about it."""
-    left = [job for job in jobs if job.get("pictures") == "auto" and job.get("error") == ""]
-    if not left:
-        return ""
-    from qs3.report.run_page import of_sweep
-
-    numbers = {Path(job["folder"]): job["job"] for job in left}
-    return of_sweep(sorted(numbers, key=lambda folder: numbers[folder]))
 
 
 def objectives(jobs: Sequence[Mapping[str, Any]], name: str) -> str:

@@ -1,4 +1,4 @@
-"""Tables of words, header first, as aligned text, Markdown, CSV and rows of LaTeX."""
+"""Tables of words, header first, as aligned text, Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -8,13 +8,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 Rows = Sequence[Sequence[str]]
-
-_LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
-    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "±": r"$\pm$", "→": r"$\rightarrow$", "†": r"$\dagger$", "‡": r"$\ddagger$",
-    "<": r"$<$", ">": r"$>$", "|": r"$|$",
-}  # fmt: skip
 
 
 def aligned(rows: Rows, *, numbers: bool = False, rule: bool = True) -> list[str]:
@@ -50,16 +43,6 @@ def csv_text(rows: Iterable[Iterable[Any]]) -> str:
         csv.writer(file).writerow(row)  # ended by \r\n it quotes cells with a \r of their own
         lines.append(file.getvalue().removesuffix("\r\n") + "\n")
     return "".join(lines)
-
-
-def latex_row(cells: Iterable[str]) -> str:
-    """A row of a tabular, with plain text in its cells."""
-    return " & ".join(map(latex_text, cells)) + r" \\"
-
-
-def latex_text(text: str) -> str:
-    """Plain text with what LaTeX would take for a command escaped."""
-    return "".join(_LATEX.get(letter, letter) for letter in text)
 
 
 def printable(text: str) -> str:

@@ -229,9 +229,7 @@ def test_a_scan_of_a_raised_object_is_of_it_alone(cfg, made, lamp):
     settings = OmegaConf.to_container(cfg.recipe, resolve=True)
     catalogue = {"_target_": "qs3.catalogue.Catalogue", "seed": 1, "train": 20, "test": 0}
     meta = {"settings": {"recipe": settings, "meshes": catalogue, "seed": lamp.seed}}
-    surfaces, reason = surfaces_of(meta, None)
-    assert surfaces is not None, reason
-    found = surfaces.mesh(
+    found = surfaces_of(meta).mesh(
         ManifestRow(id=lamp.id, cls="lamp", split="train", mesh_sha256=lamp.mesh.sha256)
     )
     np.testing.assert_array_equal(found.vertices, lamp.placed.vertices)

@@ -170,8 +170,8 @@ def test_the_mesh_is_the_truth_where_it_can_be_made_again(generated):
     assert found["truth"] == "mesh"
     assert found["median"] == pytest.approx(np.median(known.residual), rel=1e-5)
     evil = {"seed": 0, "recipe": {"placing": {"_target_": "os.system", "command": "false"}}}
-    assert surfaces_of({"settings": {**evil, "meshes": SOURCE}})[0] is None
-    assert surfaces_of({})[0] is None
+    assert surfaces_of({"settings": {**evil, "meshes": SOURCE}}) is None
+    assert surfaces_of({}) is None
 
 
 def test_without_meshes_the_clean_twin_is_the_truth(tmp_path):
@@ -259,13 +259,12 @@ def test_commands(tmp_path, capsys):
     for name in ("modelnet10_arrays", "kinectsim10"):
         fixtures.write_domain(name, tmp_path, {"train": 2, "test": 1})
     words = ["inspect", "modelnet10_arrays", f"data_dir={tmp_path}", f"out={tmp_path / 'i'}"]
-    assert main([*words, "sheets=4"]) == 0
+    assert main(words) == 0
     said = capsys.readouterr().out
     assert "30 clouds of 1024 points" in said
     assert "made of: arrays of modelnet10_points.npz\n" in said
     assert len((tmp_path / "i" / "inspection.csv").read_text().splitlines()) == 31
     assert not_blank(tmp_path / "i" / "clouds.png")
-    assert not_blank(tmp_path / "i" / "sheets" / "chair.png")
     assert "30 of 30 clouds of" in (tmp_path / "i" / "clouds.html").read_text()
     words = ["compare", "modelnet10_arrays", f"{tmp_path}/kinectsim10", f"out={tmp_path / 'c'}"]
     assert main([*words, f"a.paths.data_dir={tmp_path}", "b.variant=points_clean"]) == 0

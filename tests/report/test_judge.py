@@ -84,17 +84,14 @@ def test_classes_of_one_block_are_named(archive, logs, tmp_path):
     assert "(!) bed (all) lie in one block alone" in text(verdict)
 
 
-def test_families_parts_and_classes(archive, logs):
-    verdict = judge([str(logs)], archive, part="adapt", classes=["chair", "sofa"])
+def test_families_and_parts(archive, logs):
+    verdict = judge([str(logs)], archive, part="adapt")
     figures = verdict.figures[verdict.figures.tier == "all"]
     assert figures.run.tolist() == ["exp 0123abcd", "other ffff0000"]
     assert np.isnan(figures.accuracy_sem).tolist() == [False, True]
-    assert (verdict.classes, figures.objects.tolist()) == (("chair", "sofa"), [2, 2])
-    assert "8 objects of other classes" in verdict.about
+    assert figures.objects.tolist() == [10, 10]
     with pytest.raises(ConfigError, match="adapt, gap, judge"):
         judge([str(logs)], archive, part="x")
-    with pytest.raises(ConfigError, match="throne"):
-        judge([str(logs)], archive, classes=["throne"])
 
 
 def test_other_rows_are_compared_with_the_first(archive, logs, tmp_path):
@@ -139,15 +136,10 @@ def test_runs_are_found(archive, logs, tmp_path):
         judge([str(logs / "other"), str(again)], archive)
 
 
-def test_the_command_with_a_prior(archive, logs, tmp_path, capsys):
-    words = ["report", "judge", f"runs={logs / 'exp'}", f"data={archive}", "prior=chair:9"]
+def test_the_command(archive, logs, tmp_path, capsys):
+    words = ["report", "judge", f"runs={logs / 'exp'}", f"data={archive}"]
     assert main([*words, f"out={tmp_path}/judged.csv"]) == 0
-    printed = capsys.readouterr().out
-    assert "trained by, exp 0123abcd: qs3 0.1.0; qs3 0.1.0, commit c0ffee\n" in printed
+    assert "exp 0123abcd" in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "judged.csv").read_text().splitlines()))
-    assert [row["tier"] for row in rows] == ["all", "clean", "hard"] * 2
-    assert [row["run"] for row in rows[::3]] == ["exp 0123abcd", "exp 0123abcd, prior=chair:9"]
-    assert float(rows[3]["recall_chair"]) >= float(rows[0]["recall_chair"])
-    more = float(rows[3]["accuracy"]) - float(rows[0]["accuracy"])
-    assert float(rows[3]["accuracy_more"]) == pytest.approx(more)
+    assert [row["tier"] for row in rows] == ["all", "clean", "hard"]
     assert rows[0]["objects_chair"] == "5"

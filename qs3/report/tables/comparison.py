@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,7 +15,7 @@ import pandas as pd
 from qs3.datasets.object_archive import TIERS
 from qs3.errors import ConfigError, DataError
 from qs3.report.intervals import LEVEL, Interval, difference
-from qs3.report.tables.formats import marks, problems_of
+from qs3.report.tables.formats import marks, simulated
 from qs3.report.tables.results import CLOUDS, MESHES, answers_of, data_lines, same_data
 from qs3.report.tables.spec import chosen
 from qs3.report.tables.table import Cell, Table
@@ -72,41 +71,11 @@ def against(table: Table, base: str, *, reverse: bool = False) -> list[Compared]
 
 
 def effects(table: Table) -> list[Compared]:
-    """Main effects: each column minus the first over the rows that have both, then rows likewise.
+    """Main effects of a table whose rows cross factors: each level minus the factor's first.
 
-    Rows whose two cells are one run (a teacher that no column changes) are left out. Of a table
-    whose rows cross factors: each level minus the factor's first, over rows with equal levels of
-    the others.
+    Over rows with equal levels of the other factors. Levels come in the order of the rows, and
+    cells of all columns are pairs of their own.
     """
-    if table.factors:
-        return _effects_of_factors(table)
-    columns = {
-        name: [cells[i] for cells in table.rows.values()] for i, name in enumerate(table.columns)
-    }
-    rows = {name: list(cells) for name, cells in table.rows.items()}
-    return [*_main_effects(columns, list(table.rows)), *_main_effects(rows, list(table.columns))]
-
-
-def _main_effects(
-    lines: Mapping[str, Sequence[Cell | None]], others: Sequence[str]
-) -> list[Compared]:
-    """Each line of cells minus the first one, over the others that both have."""
-    (base, base_cells), *rest = lines.items()
-    found = []
-    for name, cells in rest:
-        both = {
-            other: (one, two)
-            for other, one, two in zip(others, cells, base_cells, strict=True)
-            if one and two and one.runnable and two.runnable and not _same(one, two)
-        }
-        if both:
-            title = f"{name} minus {base}, over {', '.join(both)}"
-            found.append(_compared(title, [*both.values()]))
-    return found
-
-
-def _effects_of_factors(table: Table) -> list[Compared]:
-    """Levels come in the order of the rows, and cells of all columns are pairs of their own."""
     levels = pd.DataFrame.from_dict(table.factors, orient="index")
     found = []
     for factor in levels:
@@ -227,45 +196,20 @@ def text(
     counts = sorted({next(iter(one.subsets.values()))[0].clusters for one in known})
     notes = [
         f"differences in percentage points with {LEVEL:.0%} intervals over seeds and test "
-        f"{clusters} ({', '.join(map(str, counts))}); * marks those whose interval does not reach "
-        "0, each line by itself: of twenty rows that are no better one gets a star"
+        f"{clusters} ({', '.join(map(str, counts))}); * marks those that do not reach 0, each "
+        "line by itself: of twenty rows that are no better one gets a star"
     ]
     if any(one.clusters == CLOUDS for one in known):
-        notes.append(
-            "which clouds show the same object is not known, so each counts as one of its own: "
-            "where several do, the intervals are too narrow"
-        )
+        notes.append("the clouds' objects are not known: if some share one, intervals are narrow")
     whys = dict.fromkeys(one.why for one in found if one.why)
     notes += [f"{', '.join(o.name for o in found if o.why == why)}: {why}" for why in whys]
     head = []
     if table:
-        head = [f"{'## ' * markdown}{table.title}", "", *marks(table), ""]
-        notes += data_lines(table.lines) + problems_of(table)
+        head = [f"{'## ' * markdown}{table.title}", "", *simulated(table), *marks(table), ""]
+        notes += data_lines(table.lines)
     layout = text_table.markdown if markdown else text_table.aligned
     body = layout(rows) if len(rows) > 1 else []
     return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"
-
-
-def csv_text(found: Sequence[Compared], base: str = "") -> str:
-    """A line a difference, metric and tier, in percentage points; `base` as of `text`."""
-    lines = []
-    for one in found:
-        about = {"name": one.name, "minus": base, "simulated": str(one.simulated).lower()}
-        pairs: Mapping[str, tuple[Interval | None, ...]] = one.subsets or {ALL: (None, None)}
-        for subset, pair in pairs.items():
-            for metric, d in zip(("accuracy", "balanced accuracy"), pair, strict=True):
-                line: dict[str, Any] = {**about, "clouds": subset, "metric": metric, "why": one.why}
-                if d:
-                    line |= {"difference": d.mean, "low": d.low, "high": d.high, "seeds": d.seeds}
-                    line |= {"clusters": d.clusters, "clusters_are": one.clusters}
-                    line["seeds_needed"] = d.seeds_needed
-                lines.append(line)
-    ends, whole = ["difference", "low", "high"], ["seeds", "clusters", "seeds_needed"]
-    columns = ["name", "minus", "clouds", "metric", *ends, *whole, "clusters_are", "simulated"]
-    table = pd.DataFrame(lines, columns=[*columns, "why"])
-    table[ends] = 100 * table[ends].astype(float)
-    table[whole] = table[whole].astype("Int64")
-    return str(table.to_csv(index=False, lineterminator="\n"))
 
 
 def _needed(one: Compared, d: Interval) -> str:

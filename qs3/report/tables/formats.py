@@ -1,4 +1,4 @@
-"""A table as Markdown, LaTeX (booktabs) and CSV, with the lines that belong below it."""
+"""A table as text, Markdown, LaTeX (booktabs) and CSV, with the lines that belong below it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from qs3.datasets.object_archive import TIERS
-from qs3.report.tables.results import COSTS, FEW_SEEDS, Runs, data_lines, task
+from qs3.report.tables.results import FEW_SEEDS, data_lines
 from qs3.report.tables.spec import Metric
 from qs3.report.tables.table import INCOMPLETE, METRICS, OTHER_DATA, Cell, Table
 from qs3.utils import text_table
@@ -18,6 +17,7 @@ from qs3.utils.files import write_text
 _ACCURACY: Metric = "accuracy"  # what papers give, and each run on labels has
 TO_RUN = "Not run yet, or with fewer seeds than are wanted"
 _RULES = {"source_val": "source validation", "last": "last epoch"}
+_SIGNS = {"±": r"$\pm$", "→": r"$\rightarrow$", OTHER_DATA: r"$\ddagger$", INCOMPLETE: r"$\dagger$"}
 
 
 def save(at: str | Path, texts: Mapping[str, str]) -> str:
@@ -28,20 +28,25 @@ def save(at: str | Path, texts: Mapping[str, str]) -> str:
 
 
 def grid(table: Table) -> list[list[str]]:
-    """The table as strings, header first."""
+    """The table as strings, header first.
+
+    Published numbers stand next to ours; in a benchmark on a line of their own.
+    """
     return _benchmark_grid(table) if table.benchmark else _plain_grid(table)
 
 
 def _plain_grid(table: Table) -> list[list[str]]:
-    """For each task our metrics, then the paper's if any."""
     many = len(table.columns) > 1
     header = ["method"]
+    has_paper = [
+        any(cell and cell.paper for cell in of) for of in zip(*table.rows.values(), strict=True)
+    ]
     for i, column in enumerate(table.columns):
         if not table.ours(i):
             header.append(f"{column}, published {METRICS[_ACCURACY]}")
             continue
         of_paper = "paper" if _ACCURACY in table.metrics else f"paper, {METRICS[_ACCURACY]}"
-        header += _heads(table, i, many) + [of_paper] * _has_paper(table, i)
+        header += _heads(table, i, many) + [of_paper] * has_paper[i]
     lines = [[*header, *["seeds"] * (not many)]]
     for name, cells in table.rows.items():
         line = [name]
@@ -50,7 +55,7 @@ def _plain_grid(table: Table) -> list[list[str]]:
             if not table.ours(i):
                 line.append(f"{paper} ({cell.entry.selected})" if cell and paper else "")
                 continue
-            line += _ours(table, cell) + [paper] * _has_paper(table, i)
+            line += _ours(table, cell) + [paper] * has_paper[i]
         if not many:
             seeds = cells[0].runs.seeds if cells[0] and cells[0].runs else []
             line.append(", ".join(map(str, seeds)) or "-")
@@ -60,20 +65,17 @@ def _plain_grid(table: Table) -> list[list[str]]:
 
 def _heads(table: Table, column: int, named: bool) -> list[str]:
     mark = " (simulated)" if table.simulated(column) else ""
-    name = f"{table.columns[column]}{mark}, " if named else ""
-    return [f"{name}{METRICS[m]}{'' if named else mark}" for m in table.metrics]
+    name = f"{table.columns[column]}{mark}"
+    if table.benchmark and len(table.metrics) == 1:
+        return [name]
+    return [f"{name}, {METRICS[m]}" if named else f"{METRICS[m]}{mark}" for m in table.metrics]
 
 
 def _benchmark_grid(table: Table) -> list[list[str]]:
-    """Published numbers and ours on a line each, with the rule by which the epoch was chosen."""
+    """With the rule by which the epoch was chosen."""
     header = ["method", "by"]
-    for i, column in enumerate(table.columns):
-        named = len(table.metrics) > 1
-        header += (
-            _heads(table, i, True)
-            if named
-            else [column + " (simulated)" * bool(table.simulated(i))]
-        )
+    for i in range(len(table.columns)):
+        header += _heads(table, i, True)
     header += [f"average {METRICS[m]}" for m in table.metrics]
     lines = [[*header, "epoch selected by"]]
     for name, cells in table.rows.items():
@@ -119,68 +121,52 @@ def _is_other(table: Table, cell: Cell | None) -> bool:
     )
 
 
-def _has_paper(table: Table, column: int) -> bool:
-    return any((cell := row[column]) and cell.paper for row in table.rows.values())
-
-
 def marks(table: Table) -> list[str]:
-    """What must not be overlooked: simulated targets, other data or meshes, seeds that failed."""
-    simulated = _unique(name for i in range(len(table.columns)) for name in table.simulated(i))
-    lines = [f"SIMULATED target: {', '.join(simulated)}"] if simulated else []
-    other = [cell.runs.finished for cell in table.cells if _is_other(table, cell) and cell.runs]
-    if other:
-        said = [line.removeprefix("data: ") for line in data_lines(pd.concat(other))]
+    """What must not be overlooked: other data than published figures have, seeds that failed."""
+    lines = []
+    if any(_is_other(table, cell) for cell in table.cells):
         lines.append(
-            f"{OTHER_DATA} not the data of the published figures, so not to be compared with them: "
-            + "; ".join(said)
+            f"{OTHER_DATA} not the data of the published figures: not to be compared with them"
         )
-    runs = table.lines
-    sources = runs[runs.meshes != ""].drop_duplicates("meshes") if len(runs) else runs
-    if len(sources) > 1:
-        made = [f"{r.source} ({r.source_made_of}; meshes {r.meshes})" for r in sources.itertuples()]
-        lines.append(f"the sources are made from different meshes: {'; '.join(made)}")
     if any(cell.incomplete for cell in table.cells):
-        lines.append(f"{INCOMPLETE} seeds that failed, are not finished or do not fit: see below")
-    return lines
+        lines.append(f"{INCOMPLETE} seeds that failed, are not finished or do not fit")
+    return [*lines, *problems_of(table)]
 
 
-def remarks(table: Table) -> list[str]:
-    """The lines below a table: what it is measured on, how models were chosen, what is missing."""
-    runs = table.lines
-    lines = [*marks(table), *table.notes]
-    if len(runs):
-        lines += data_lines(runs)
-        for target, some in runs.groupby("target", sort=False):
-            lines.append(f"majority rate of {target}: {_majority(some)}")
-        for role in ("teacher", "student"):
-            lines.append(f"{role} selected by: {', '.join(_unique(runs[f'{role}_selected']))}")
-        counts = runs.groupby(["row", "column"]).size()
-        seeds = " to ".join(dict.fromkeys(map(str, (counts.min(), counts.max()))))
-        lines.append(f"mean ± standard error over {seeds} seeds; (n=...): fewer than {FEW_SEEDS}")
-    for source in _unique(cell.entry.source for cell in table.cells if cell.paper):
-        rows = _unique(c.row for c in table.cells if c.paper and c.entry.source == source)
-        lines.append(f"published numbers of {', '.join(rows)}: {source}")
-    return _unique([*lines, *problems_of(table)])
-
-
-def _majority(runs: pd.DataFrame) -> str:
-    """Such as "32.0 %"; with that of each tier, where there are tiers."""
-
-    def rates(score: str) -> str:
-        return " or ".join(sorted({f"{100 * value:.1f} %" for value in runs[score].dropna()}))
-
-    tiers = [f"{tier} {rate}" for tier in TIERS if (rate := rates(f"majority_rate_{tier}"))]
-    return ", ".join([rates("majority_rate") or "not known", *tiers])
+def simulated(table: Table) -> list[str]:
+    """A line that names simulated targets, if there are some."""
+    names = _unique(name for i in range(len(table.columns)) for name in table.simulated(i))
+    return [f"SIMULATED target: {', '.join(names)}"] if names else []
 
 
 def problems_of(table: Table) -> list[str]:
-    """What is wrong with cells' runs, or odd about them, each once."""
+    """What is wrong with cells' runs, each once."""
     return _unique(
         f"{cell.row}, {cell.column}: {said}"
         for cell in table.cells
         if cell.runs
-        for said in (*cell.runs.problems, *cell.runs.notes)
+        for said in cell.runs.problems
     )
+
+
+def remarks(table: Table) -> list[str]:
+    """The lines below a table: what it is measured on, how models were chosen, who published."""
+    runs = table.lines
+    lines = [*simulated(table), *marks(table), *table.notes]
+    if len(runs):
+        lines += data_lines(runs)
+        for target, some in runs.groupby("target", sort=False):
+            rates = _unique(f"{100 * rate:.1f} %" for rate in some.majority_rate.dropna())
+            lines.append(f"majority rate of {target}: {' or '.join(rates) or 'not known'}")
+        rules = (
+            f"{role} selected by {', '.join(_unique(runs[f'{role}_selected']))}"
+            for role in ("teacher", "student")
+        )
+        lines.append(f"{'; '.join(rules)}; mean ± SEM over seeds, n of fewer than {FEW_SEEDS}")
+    for source in _unique(cell.entry.source for cell in table.cells if cell.paper):
+        rows = _unique(c.row for c in table.cells if c.paper and c.entry.source == source)
+        lines.append(f"published numbers of {', '.join(rows)}: {source}")
+    return _unique(lines)
 
 
 def to_run(table: Table) -> list[str]:
@@ -197,6 +183,12 @@ def to_run(table: Table) -> list[str]:
     )
 
 
+def text(table: Table) -> str:
+    """For a terminal: the title, the table, what must not be overlooked, and the file's notes."""
+    lines = [table.title, "", *text_table.aligned(grid(table)), "", *marks(table), *table.notes]
+    return "\n".join(lines) + "\n"
+
+
 def markdown(table: Table) -> str:
     """Title, table, remarks, and the commands of what is not run."""
     rows = [[cell.replace("*", r"\*") for cell in line] for line in grid(table)]
@@ -208,53 +200,37 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    """A booktabs tabular; remarks as comments, and what must be seen as lines below the rule."""
+    """A booktabs tabular; remarks as comments."""
     header, *body = grid(table)
     notes = [table.title, r"\usepackage{booktabs}", *remarks(table)]
-    lines = [f"% {' '.join(note.split())}" for note in notes]
-    lines += [rf"\begin{{tabular}}{{@{{}}l{'c' * (len(header) - 1)}@{{}}}}", r"\toprule"]
-    rows = map(text_table.latex_row, body)
-    lines += [text_table.latex_row(header), r"\midrule", *rows, r"\bottomrule"]
-    for mark in marks(table):
-        text = text_table.latex_text(mark.removesuffix(": see below"))
-        lines.append(rf"\multicolumn{{{len(header)}}}{{@{{}}l@{{}}}}{{\footnotesize {text}}} \\")
-    return "\n".join([*lines, r"\end{tabular}"]) + "\n"
+    found = pd.DataFrame(body, columns=header).to_latex(index=False, escape=True)
+    for sign, command in _SIGNS.items():
+        found = found.replace(sign, command)
+    return "".join(f"% {' '.join(note.split())}\n" for note in notes) + found
 
 
 def csv_text(table: Table) -> str:
     """A line a cell and metric, in percent, with the command and what is wrong."""
-    lines = [_csv_line(cell, metric) for cell in table.cells for metric in table.metrics]
+    lines = []
+    for cell in table.cells:
+        first = cell.runs.first if cell.runs else None
+        known: Mapping[str, Any] = {} if first is None else first
+        for metric in table.metrics:
+            stat = cell.ours(metric)
+            lines.append({
+                "row": cell.row,
+                "column": cell.column,
+                "metric": METRICS[metric].removesuffix(" %"),
+                "mean": 100 * stat.mean if stat else None,
+                "sem": 100 * stat.sem if stat and stat.sem is not None else None,
+                "seeds": " ".join(map(str, cell.runs.seeds)) if cell.runs else "",
+                "paper": cell.paper if metric == _ACCURACY else None,
+                "paper_selected": cell.entry.selected,
+                "target": cell.target,
+                "simulated": str(cell.simulated).lower() if cell.target else None,
+                "teacher_selected": known.get("teacher_selected"),
+                "student_selected": known.get("student_selected"),
+                "problems": "; ".join(cell.runs.problems) if cell.runs else "",
+                "command": cell.command,
+            })  # fmt: skip
     return pd.DataFrame(lines).to_csv(index=False, lineterminator="\n")
-
-
-def _csv_line(cell: Cell, metric: Metric) -> dict[str, Any]:
-    runs = cell.runs or Runs(pd.DataFrame(columns=["problem", "seed", *COSTS]))
-    first, stat = runs.first, cell.ours(metric)
-
-    def joined(name: str) -> str:
-        return " ".join(f"{v:g}" for v in runs.finished[name].dropna()) if first is not None else ""
-
-    def known(name: str) -> Any:
-        return None if first is None else first[name]
-
-    return {
-        "row": cell.row,
-        "column": cell.column,
-        "metric": METRICS[metric].removesuffix(" %"),
-        "mean": 100 * stat.mean if stat else None,
-        "sem": 100 * stat.sem if stat and stat.sem is not None else None,
-        "n": stat.n if stat else 0,
-        "seeds": " ".join(map(str, runs.seeds)),
-        "paper": cell.paper if metric == _ACCURACY else None,
-        "paper_selected": cell.entry.selected,
-        "paper_source": cell.entry.source,
-        "task": None if first is None else task(first),
-        "target": cell.target,
-        "simulated": str(cell.simulated).lower() if cell.target else None,
-        **{f"{role}_made_of": known(f"{role}_made_of") for role in ("source", "target")},
-        **{f"{role}_selected": known(f"{role}_selected") for role in ("teacher", "student")},
-        **{name: joined(name) for name in COSTS},
-        "problems": "; ".join((*runs.problems, *runs.notes)) if cell.runs else "",
-        "hash": known("hash"),
-        "command": cell.command,
-    }

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,7 +32,6 @@ from jaxtyping import Int
 
 from qs3.datasets.object_archive import TIERS
 from qs3.errors import ConfigError, DataError
-from qs3.runs.folder import read_code
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE, read_predictions
 from qs3.utils.files import write_bytes
@@ -97,7 +95,6 @@ def record(metrics: RunMetrics, take: str = "final") -> dict[str, Any]:
         "labelled": scores[""].accuracy is not None,
         **{f"{n}{tier}": getattr(s, n) for tier, s in scores.items() for n in _NAMES},
         **{name: getattr(metrics.times, name) for name in COSTS},
-        "commit": metrics.versions.get("commit", ""),
     }
 
 
@@ -135,22 +132,15 @@ def load_run(folder: Path) -> dict[str, Any]:
     }
 
 
-def frame(runs: Iterable[Mapping[str, Any]], take: str = "final") -> pd.DataFrame:
+def frame(runs: Sequence[Mapping[str, Any]], take: str = "final") -> pd.DataFrame:
     """Runs of `load_runs` as lines; those of unfinished runs have a `problem` and no scores."""
-    lines = [
-        {
-            **(record(run["metrics"], take) if "metrics" in run else run),
-            "folder": str(run["folder"]),
-            "code": " ".join(f"{k}={v}" for k, v in read_code(run["folder"]).items()),
-        }
-        for run in runs
-    ]
-    return complete(pd.DataFrame(lines))
+    lines = [record(run["metrics"], take) if "metrics" in run else dict(run) for run in runs]
+    return complete(pd.DataFrame(lines).assign(folder=[str(run["folder"]) for run in runs]))
 
 
 def complete(lines: pd.DataFrame) -> pd.DataFrame:
     """All columns there, with numbers and flags as such and "" for what is not known."""
-    columns = ("seed", "experiment", "hash", "problem", "folder", "code", "take", *_NUMBERS)
+    columns = ("seed", "experiment", "hash", "problem", "folder", "take", *_NUMBERS)
     lines = lines.reindex(columns=list(dict.fromkeys([*lines.columns, *columns, *_SEEN, *_FLAGS])))
     for name in _NUMBERS:
         lines[name] = pd.to_numeric(lines[name].replace("", np.nan))
@@ -243,8 +233,8 @@ class Stat:
     def of(values: Sequence[float] | pd.Series) -> Stat:
         """From at least one value."""
         series = pd.Series(values, dtype=float)
-        sem = float(series.sem())
-        return Stat(float(series.mean()), None if math.isnan(sem) else sem, len(series))
+        sem = float(series.sem()) if len(series) > 1 else None
+        return Stat(float(series.mean()), sem, len(series))
 
     def percent(self) -> str:
         """Such as "64.0 ± 1.0"; without a SEM for a single seed."""
@@ -257,7 +247,7 @@ class Runs:
 
     A failed or unfinished seed is shown and never averaged over silently; runs that saw different
     datasets have no mean at all. Datasets of one recipe, made by machines that round in other ways,
-    are one dataset; a note says so.
+    are one dataset.
     """
 
     def __init__(self, lines: pd.DataFrame) -> None:
@@ -301,25 +291,10 @@ class Runs:
             found.append(f"seeds {_list(twice.seed.unique())} occur twice ({places}): not averaged")
         for key, what in _SEEN.items():
             if not same_data(self.finished, key):
-                found.append(f"{what} ({self._versions(key)}): not averaged")
+                by_hash = self.finished.groupby(key, sort=False).seed
+                versions = (f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in by_hash)
+                found.append(f"{what} ({'; '.join(versions)}): not averaged")
         return found
-
-    @property
-    def notes(self) -> list[str]:
-        """What is odd, but keeps no seed from being averaged."""
-        found = [
-            f"the {what.removesuffix(' differs').removeprefix('the ')} was made by one recipe on "
-            f"several machines, whose bytes differ by rounding ({self._versions(key)}): averaged"
-            for key, what in _SEEN.items()
-            if self.finished[key].nunique() > 1 and same_data(self.finished, key)
-        ]
-        if (self.finished.code != "").all() and self.finished.code.nunique() > 1:
-            found.append("code was edited between seeds: averaged")
-        return found
-
-    def _versions(self, key: str) -> str:
-        by_hash = self.finished.groupby(key, sort=False).seed
-        return "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in by_hash)
 
 
 def same_data(lines: pd.DataFrame, key: str) -> bool:
@@ -369,7 +344,7 @@ def summarise(folders: Sequence[Path], settings: Mapping[Path, str] | None = Non
         name = " ".join(map(str, key))
         if first is not None and not first.labelled:
             notes.append(f"{name}: no target labels, so no accuracy")
-        notes += [f"{name}, {said}" for said in (*runs.problems, *runs.notes)]
+        notes += [f"{name}, {said}" for said in runs.problems]
     if any("(!)" in row[-2] for row in rows):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."

@@ -7,16 +7,14 @@ nothing, and is listed at the end.
 from __future__ import annotations
 
 import json
-import shlex
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from qs3.config.location import python_command, typed
+from qs3.config.location import python_command
 from qs3.config.quoting import override
-from qs3.errors import ConfigError
 from qs3.report.tables.spec import chosen
 from qs3.report.tables.table import Table
 
@@ -43,15 +41,8 @@ class Job:
     name: str
     overrides: tuple[str, ...]
 
-    @property
-    def command(self) -> str:
-        """What a user would type."""
-        return typed(f"python train.py {shlex.join(self.overrides)}")
 
-
-def missing(
-    table: Table, seeds: Sequence[int] = (), rows: Sequence[str] = (), columns: Sequence[str] = ()
-) -> list[Job]:
+def missing(table: Table, seeds: Sequence[int] = (), rows: Sequence[str] = ()) -> list[Job]:
     """What is to be run: row by row, in each row seed by seed; what cells share, once.
 
     Cells whose file says `first: true` come before the others: long runs that would otherwise be
@@ -59,15 +50,10 @@ def missing(
 
     Args:
         seeds: that each cell should have; none: those that the table wants.
-        rows, columns: only those that these words mean (`spec.chosen`); all if empty.
-
-    Raises:
-        ConfigError: a word means nothing, or all together mean no cell that can be run.
+        rows: only those that these words mean (`spec.chosen`); all if empty.
     """
-    meant = chosen(table.columns, columns, "columns: "), chosen(table.rows, rows, "rows: ")
-    cells = [c for c in table.cells if c.runnable and c.column in meant[0] and c.row in meant[1]]
-    if not cells:
-        raise ConfigError(f"nothing of {', '.join((*rows, *columns))} can be run")
+    meant = chosen(table.rows, rows, "rows: ")
+    cells = [cell for cell in table.cells if cell.runnable and cell.row in meant]
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in sorted(cells, key=lambda cell: not cell.entry.first):
         done = set(cell.runs.seeds) if cell.runs else set()

@@ -83,10 +83,8 @@ class Cell:
     @property
     def command(self) -> str:
         """The command that fills the cell; "" if there is none."""
-        if not self.runnable:
-            return ""
-        seeds = ",".join(map(str, self.seeds))
-        return typed(f"python train.py {shlex.join(self.overrides)} seed={seeds} -m")
+        words = f"{shlex.join(self.overrides)} seed={','.join(map(str, self.seeds))} -m"
+        return typed(f"python train.py {words}") if self.runnable else ""
 
     @property
     def incomplete(self) -> bool:
@@ -107,14 +105,11 @@ class Cell:
         mark = f" {INCOMPLETE}" if self.incomplete else ""
         if (stat := self.ours(metric)) is not None:
             return _with_n(stat) + mark
-        if not self.runnable or not self.finished:
+        if self.runs is None or not self.finished:
             return f"not finished{mark}" if mark else "not run" if self.runnable else ""
-        assert self.runs is not None
         if not self.runs.finished.labelled.any():
             return "no target labels"
-        if self.runs.finished[metric].isna().all():
-            return "not of warm-ups" if self.entry.take == "warmup" else "no such tier"
-        return f"not averaged{mark}"
+        return "-" if self.runs.finished[metric].isna().all() else f"not averaged{mark}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +118,8 @@ class Table:
 
     Attributes:
         name: of its file.
+        file_name: of its own files: with the target and the columns that were asked for.
+        log_dir: of its runs.
         title, notes: for above and below it.
         metrics: keys of METRICS.
         columns: names of the tasks.
@@ -134,6 +131,8 @@ class Table:
     """
 
     name: str
+    file_name: str
+    log_dir: str
     title: str
     notes: tuple[str, ...]
     metrics: tuple[Metric, ...]
@@ -252,8 +251,11 @@ def build_table(
             cells.append(cell)
         filled[row.name] = tuple(cells)
     averages = {row.name: row.average for row in spec.rows if row.average is not None}
+    parts = [re.sub(r"[^\w.]+", "-", one).strip("-.") for one in (name, target or "", *columns)]
     return Table(
         name,
+        "-".join(filter(None, parts)),
+        str(log_dir),
         f"{spec.title}, on another target: {target}" if target else spec.title,
         (*spec.notes, *([f"all cells on {target}, not the paper's target"] if target else [])),
         tuple(spec.metrics),

@@ -1,12 +1,9 @@
 """Differences of rows and effects, by hand, from runs and from kept files."""
 
-import csv
-import io
-
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.report.tables.comparison import against, csv_text, effects, text
+from qs3.report.tables.comparison import against, effects, text
 from qs3.report.tables.results import write_kept
 from qs3.report.tables.table import build_table, kept_lines
 from qs3.runs.metrics import DataHashes, Evaluated
@@ -48,11 +45,7 @@ def test_by_hand(tmp_path):
     assert shown.startswith(table.title)
     assert "SIMULATED target: kinectsim10" in shown.splitlines()
     assert "+20.0 [" in shown
-    assert "each counts as one of its own" in shown  # these predictions know no objects
-    rows = list(csv.DictReader(io.StringIO(csv_text([*found.values()], "source only"))))
-    (row,) = (r for r in rows if (r["name"], r["metric"]) == ("DANN", "accuracy"))
-    assert float(row["difference"]) == pytest.approx(20)
-    assert (row["minus"], row["seeds"], row["clusters"]) == ("source only", "3", "20")
+    assert "intervals are narrow" in shown  # these predictions know no objects
     (less,) = (one for one in against(table, "DANN", reverse=True) if one.name == "source only")
     assert less.subsets["all"][0].mean == pytest.approx(0.2)
     for word in ("x", "a"):  # none, and several
@@ -81,7 +74,7 @@ def test_tiers_and_blocks_from_runs_and_from_a_kept_file(tmp_path):
         clusters = {name: pair[0].clusters for name, pair in found.subsets.items()}
         assert clusters == {"all": 4, "clean": 2, "hard": 2}
         assert "seeds and test blocks of frames (4)" in text(compared)
-    assert csv_text(against(table, "DANN")) == csv_text(against(kept, "DANN"))
+    assert text(against(table, "DANN")) == text(against(kept, "DANN"))
 
 
 def test_what_cannot_be_compared(tmp_path):
@@ -122,34 +115,6 @@ def test_runs_are_not_compared_with_themselves(tmp_path):
     table = fill(tmp_path, str(tmp_path / "own.yaml"), {"a": 10})
     (one,) = against(table, "a")
     assert "the same runs" in one.why
-
-
-SCHEMES = """
-title: Schemes
-metrics: [accuracy]
-columns: [scratch, beside]
-rows:
-  - name: QBST
-    scratch: {run: experiment=cad10 selftraining=qbst}
-    beside: {run: experiment=cad10 selftraining=qbst selftraining.use_source=true}
-  - name: SPST
-    scratch: {run: experiment=cad10 selftraining=spst}
-    beside: {run: experiment=cad10 selftraining=spst selftraining.use_source=false}
-  - name: none
-    run: experiment=cad10
-"""
-
-
-def test_effects_by_hand(tmp_path):
-    (tmp_path / "own.yaml").write_text(SCHEMES)
-    right = {("QBST", "scratch"): 8, ("QBST", "beside"): 14}
-    right |= {("SPST", "scratch"): 10, ("SPST", "beside"): 12, ("none", "scratch"): 4}
-    found = {one.name: one for one in effects(fill(tmp_path, str(tmp_path / "own.yaml"), right))}
-    scheme = found["beside minus scratch, over QBST, SPST"]  # of the teacher both are one run
-    assert scheme.subsets["all"][0].mean == pytest.approx((6 + 2) / 2 / 20)
-    assert found["SPST minus QBST, over scratch, beside"].subsets["all"][0].mean == 0
-    none = found["none minus QBST, over scratch, beside"]
-    assert none.subsets["all"][0].mean == pytest.approx((-4 - 10) / 2 / 20)
 
 
 def test_effects_of_crossed_factors(tmp_path):

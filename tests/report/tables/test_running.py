@@ -21,11 +21,9 @@ def test_only_what_is_missing_is_run(tmp_path):
     assert [job.name for job in missing(table, rows=["dann"])] == ["DANN, seed 1"]
     assert [job.name for job in missing(table, [0], ["adabn", "dann"])] == ["AdaBN, seed 0"]
     jobs = missing(table)
-    assert jobs[0].command.startswith("python train.py experiment=cad10 ")
     assert len({job.overrides for job in jobs}) == len(jobs)
-    for words in ({"rows": ["mars"]}, {"columns": ["mars"]}):
-        with pytest.raises(ConfigError, match="mars"):
-            missing(table, **words)
+    with pytest.raises(ConfigError, match="mars"):
+        missing(table, rows=["mars"])
 
 
 def test_long_runs_begin_first(tmp_path):
