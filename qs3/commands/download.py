@@ -18,7 +18,6 @@ def download(
     mirror: Annotated[str, f"address of a copy of the archives; else that of ${MIRROR}"] = "",
     archive: Annotated[Path | None, "unpack this, e.g. what your browser downloaded"] = None,
     root: Annotated[str, "folder in the archive to take, if it cannot be found out"] = "",
-    keep: Annotated[bool, "false deletes the archive when it is unpacked"] = True,
 ) -> int:
     """Published datasets, put where their domain looks for them.
 
@@ -47,7 +46,7 @@ def download(
     source = SOURCES[name]
     try:
         places = provide(
-            source, into, accept_terms=accept_terms, archive=archive, root=root, keep=keep,
+            source, into, accept_terms=accept_terms, archive=archive, root=root,
             mirror=mirror or os.environ.get(MIRROR, ""),
         )  # fmt: skip
     except AgreementError as error:

@@ -142,7 +142,6 @@ class ScanObjectNN(ArrayFiles):
     """
 
     variant: str = ""
-    complete: ClassVar[bool] = False
     up: ClassVar[str] = "y"
 
     def files(self) -> list[tuple[str, Path]]:

@@ -214,7 +214,7 @@ class Domain:
             return
         now = importer.settings()
         if not importer.is_there():  # the published files were put away after the import
-            now.update({key: imported.get(key) for key in ("folder", "files") if key in now})
+            now.update({key: imported[key] for key in ("folder", "files") if key in imported})
         if imported.get("on_error") == "stop":  # nothing was wrong, so nothing was left out
             now["on_error"] = "stop"
         if changed := sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k)):

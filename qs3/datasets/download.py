@@ -111,7 +111,6 @@ def provide(
     mirror: str = "",
     archive: Path | None = None,
     root: str = "",
-    keep: bool = True,
 ) -> list[Path]:
     """Bring the folders of a source to where their importers look; what is there stays.
 
@@ -130,8 +129,6 @@ def provide(
         if missing := {part: at for part, at in places.items() if not _is_in_place(at, source)}:
             path = archive or fetch(source, downloads / source.file, mirror)
             _place(source, missing, path, root, published)
-            if archive is None and not keep:
-                path.unlink()
     return list(places.values())
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import logging
 import re
 from collections import Counter
@@ -233,7 +232,6 @@ class CloudFolder(Importer):
     layout: Literal["auto", "class/split", "split/class", "class", "none"] = "auto"
     up: UpAxis = "z"
     test_every: Annotated[int, Ge(0)] = 5
-    complete: ClassVar[bool] = False
     thins: ClassVar[bool] = True
 
     def made_of(self) -> MadeOf:
@@ -262,14 +260,9 @@ class CloudFolder(Importer):
             found = _with_tests(found, self.test_every)
         return by_class(found, classes)
 
-    def settings(self) -> dict[str, Any]:
-        """See `Importer`; with a digest of the files' names, sizes and times of change."""
-        digest = hashlib.sha256()
-        for path in _files(self.root):
-            stat = path.stat()
-            name = path.relative_to(self.root).as_posix()
-            digest.update(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode())
-        return {**super().settings(), "files": digest.hexdigest()}
+    def watched(self) -> Iterable[Path]:
+        """See `Importer`."""
+        return _files(self.root)
 
     def _layout(self, classes: Sequence[str]) -> str:
         """The layout in the names of the folders; DataError if they fit none."""

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import abc
 import functools
-import hashlib
 import logging
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -114,8 +113,6 @@ class CutDataset(Importer):
 
     workers: Annotated[int, Ge(0)] = 0
 
-    complete: ClassVar[bool] = False
-
     @abc.abstractmethod
     def files(self) -> Sequence[Path]:
         """What is read at once; a change of them is noticed."""
@@ -147,13 +144,15 @@ class CutDataset(Importer):
         """
         return id_.rsplit("/", 1)[-1].rsplit("_", 2)[0]
 
+    def watched(self) -> Iterable[Path]:
+        """See `Importer`."""
+        return self.files()
+
     def settings(self) -> dict[str, Any]:
-        """See `Importer`; with a digest of the files' sizes and times of change."""
+        """See `Importer`."""
         values = super().settings()
         del values["workers"]
-        stats = [path.stat() for path in self.files() if path.is_file()]
-        digest = hashlib.sha256(repr([(s.st_size, s.st_mtime_ns) for s in stats]).encode())
-        return {**values, "files": digest.hexdigest()}
+        return values
 
     def read(
         self, classes: Sequence[str], work: Path
@@ -177,9 +176,7 @@ class CutDataset(Importer):
         found.sort(key=lambda f: (SPLITS.index(f[0].split), label.get(f[0].cls, -1), f[0].id))
         rows = [row for row, _ in found]
         clouds = [cloud for _, cloud in found if cloud is not None]
-        report(rows, self.points, self.root)
-        if not clouds:
-            raise DataError(f"{self.root}: no object could be cut")
+        report(rows, classes, self.points, self.root)
         return clouds, rows
 
     def _begun(self, work: Path) -> PartFiles:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+import hashlib
 import json
 import logging
 import os
@@ -79,9 +80,6 @@ class Importer(abc.ABC):
     points: Annotated[int, Ge(1)] = 2048
     on_error: Literal["stop", "skip"] = "stop"
 
-    complete: ClassVar[bool] = True
-    """Whether a class without clouds in a split means that something is wrong."""
-
     recorded: ClassVar[str] = "imported"
     """The key of the settings in the store's meta.yaml."""
 
@@ -149,14 +147,25 @@ class Importer(abc.ABC):
             clouds.append(self.turn(cloud, row.cls))
             measured = len(raw) if row.valid_points is None else row.valid_points
             rows.append(dataclasses.replace(row, valid_points=measured))
-        _check_complete(rows, classes, self.root, strict=self.complete)
-        report(rows, self.points, self.root)
+        report(rows, classes, self.points, self.root)
         return clouds, rows
+
+    def watched(self) -> Iterable[Path]:
+        """Files that are noticed to have changed after an import, by their sizes and times."""
+        return ()
 
     def settings(self) -> dict[str, Any]:
         """Plain values that decide what `read` gives; kept in the store's meta.yaml."""
         values = {"format": type(self).__name__, **dataclasses.asdict(self)}
         plain: dict[str, Any] = json.loads(json.dumps({**values, "folder": str(self.root)}))
+        stats = [
+            (os.path.relpath(path, self.root), path.stat())
+            for path in self.watched()
+            if path.is_file()
+        ]
+        if stats:
+            seen = repr([(name, one.st_size, one.st_mtime_ns) for name, one in stats])
+            plain["files"] = hashlib.sha256(seen.encode()).hexdigest()
         return plain
 
 
@@ -289,25 +298,16 @@ def turned(cloud: Float[np.ndarray, "*b 3"], up: str) -> Float[np.ndarray, "*b 3
     return cloud[..., columns] * np.array(signs, dtype=cloud.dtype)
 
 
-def _check_complete(
-    rows: Iterable[ManifestRow], classes: Sequence[str], where: Path, *, strict: bool
-) -> None:
-    """Raise DataError (or warn) if a class has no cloud in a split that other classes have."""
-    have = {(row.split, row.cls) for row in rows if row.status == "ok"}
-    if not have:
+def report(rows: Sequence[ManifestRow], classes: Sequence[str], points: int, where: Path) -> None:
+    """Log what is missing, filled up or left out: never silently. DataError if nothing is there."""
+    kept = [row for row in rows if row.status == "ok"]
+    if not kept:
         raise DataError(f"{where} holds no clouds that can be read")
-    for split in sorted({split for split, cls in have if cls}):
-        if empty := [name for name in classes if (split, name) not in have]:
-            problem = f"{where}: split {split!r} has no clouds of {', '.join(empty)}"
-            if strict:
-                raise DataError(problem)
-            log.warning("%s", problem)
-
-
-def report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
-    """Log how many clouds were filled up and how many left out: never silently."""
-    short = sum((row.valid_points or points) < points for row in rows if row.status == "ok")
-    if short:
+    for split in sorted({row.split for row in kept if row.cls}):
+        have = {row.cls for row in kept if row.split == split}
+        if empty := [name for name in classes if name not in have]:
+            log.warning("%s: split %r has no clouds of %s", where, split, ", ".join(empty))
+    if short := sum((row.valid_points or points) < points for row in kept):
         log.warning("%s: clouds under %d points, some repeated: %d", where, points, short)
     skipped = [row for row in rows if row.status != "ok"]
     for row in skipped[:_SHOWN]:

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -40,9 +40,6 @@ class Joined(Importer):
     """
 
     datasets: list[str] = field(default_factory=list)
-
-    complete: ClassVar[bool] = False
-    """They were checked when they were made."""
 
     @property
     def stores(self) -> list[Path]:

@@ -132,7 +132,6 @@ class ObjectArchive(Importer):
     inliers_only: bool = True
     tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: ["clean", "hard"])
 
-    complete: ClassVar[bool] = False
     thins: ClassVar[bool] = True
 
     @property
@@ -196,9 +195,7 @@ class ObjectArchive(Importer):
         """The split of each object; "" for those that are left out."""
         asked = {*self.train_parts, *self.test_parts}
         if unknown := sorted(asked - {*archive.parts, ADAPT, JUDGE}):
-            raise ConfigError(
-                f"{self.path} has the parts {', '.join(archive.parts)}, not {', '.join(unknown)}"
-            )
+            raise ConfigError(f"{self.path}: {unknown} are not of its parts {[*archive.parts]}")
         if self.fold is None:
             if not (archive.dev != "").any():
                 return ["test"] * len(archive)

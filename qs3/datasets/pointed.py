@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import label
 
 from qs3.datasets.cutting import CLEAN, HARD, Fault, Piece, cut_out, faults
 from qs3.datasets.depth_images import CAMERA_UP, DepthImage, Pinhole, checked_mask, upright
@@ -48,7 +47,6 @@ _LEAST_SUPPORT = 0.15  # share of the points beside and below a box that a suppo
 _LEAST_PX = 60
 _OWN = 0.6  # share of a piece that must lie within the box for it not to be background
 _JOIN = 0.2  # of the size of a box's largest piece: what is so near is of the same object
-_PLACE = 0.05  # share of a mask that is more than a few stray pixels
 _TRIM = 3.0  # median absolute deviations
 _STEEPEST = np.cos(np.deg2rad(20.0))  # of a support
 
@@ -160,34 +158,18 @@ def _judged(
     if not piece.pixels and edge_px:  # so thin that nothing else is there
         piece = cut_out(image, mask, RULES, 0)
     without, turn = int((mask & (image.depth_m <= 0)).sum()), image.world_from_camera
-    if why:
-        return Pointed(name, piece, mask, without, POOR, (), how, turn, why)
     if not piece.pixels:
         near, far = RULES.near_m, RULES.far_m
         some = (mask & (image.depth_m > 0)).any()
         range_ = f" from {near:g} to {far:g} m" if some else ""
-        why = f"none of its {int(mask.sum())} pixels has depth{range_}"
+        why = why or f"none of its {int(mask.sum())} pixels has depth{range_}"
         return Pointed(name, piece, mask, without, POOR, (), how, turn, why)
     found = faults(piece, "", RULES)
     tier = tier_of(found)
     if tier == CLEAN and any(caution.kind == BOX for caution in unsure):
         tier = HARD
     cautions = (*(Caution(fault.kind, fault.words) for fault in found), *unsure)
-    cautions += _several(mask, piece.kept)
     return Pointed(name, piece, mask, without, tier, cautions, how, turn)
-
-
-def _several(mask: Bool[np.ndarray, "h w"], kept: float) -> tuple[Caution, ...]:
-    """A caution where a number marks several things, of which one is taken."""
-    if kept > 1 - _PLACE:
-        return ()
-    numbers, _ = label(mask)
-    sizes = np.bincount(numbers[mask])
-    places = int((sizes >= max(_PLACE * sizes.sum(), _LEAST_PX)).sum())
-    if places < 2:
-        return ()
-    words = f"its number marks {places} separate places; one with {kept:.0%} of it was taken"
-    return (Caution("several", words),)
 
 
 def tier_of(found: Sequence[Fault]) -> str:

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qs3.classes import CLASSES
 from qs3.datasets.cutting import Box, box_mask, cut
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
 from qs3.datasets.nyuv2 import AREA
@@ -143,13 +142,6 @@ def test_refusals_say_why(rules):
     assert (nothing.refused, nothing.pixels) == (True, 0)
 
 
-def test_flat_is_hard_unless_the_class_is(rules):
-    plate = Thing("toy", 0, 2.5, boxes=((0, 0, 0.5, 0.6, 0.01, 0.6),))
-    image, shown = seen(Shot([plate]), noisy=False)
-    assert cut(image, shown == 0, "cabinet", rules).why == "flat"
-    assert cut(image, shown == 0, "monitor", rules).tier == "clean"
-
-
 def test_outliers_are_flagged_or_dropped(rules):
     image, shown = seen(Shot([Thing("chair", 0, 2.4, 35)]))
     kept = cut(image, shown == 0, "chair", rules)
@@ -157,12 +149,6 @@ def test_outliers_are_flagged_or_dropped(rules):
     assert 0.9 < kept.inlier.mean() < 1
     np.testing.assert_array_equal(dropped.points_m, kept.points_m[kept.inlier])
     assert dropped.pixels == kept.pixels
-
-
-def test_the_defaults_are_those_of_the_config(rules):
-    assert dataclasses.replace(rules, limits={}) == Rules()
-    assert rules.limits_of("anything") == Limits()
-    assert set(rules.limits) == {"default", *CLASSES}
 
 
 def test_a_camera_that_looks_straight_down_or_up_is_the_limit_of_one_that_nearly_does():

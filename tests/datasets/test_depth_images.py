@@ -108,88 +108,40 @@ def test_masks_of_all_kinds(tmp_path):
 MATRIX = [[525.0, 0, 319.5], [0, 526.0, 239.5], [0, 0, 1]]
 
 
+FOUR = {"fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5}
+SIZE = {"width": 640, "height": 480}
+ROWS, COLUMNS = np.ravel(MATRIX).tolist(), np.array(MATRIX).T.ravel().tolist()
+ROS = {"image_width": 640, "image_height": 480, "camera_matrix": {"rows": 3, "data": ROWS}}
+
+
 @pytest.mark.parametrize(
-    ("name", "content", "size", "bent"),
+    ("content", "size", "bent"),
     [
-        ("a.json", {"fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5}, None, False),
-        (
-            "b.json",  # librealsense
-            {
-                **{"fx": 525, "fy": 526, "ppx": 319.5, "ppy": 239.5, "width": 640, "height": 480},
-                "coeffs": [0, 0, 0, 0, 0],
-            },
-            (640, 480),
-            False,
-        ),
-        (
-            "c.json",  # Open3D, by columns
-            {
-                "width": 640,
-                "height": 480,
-                "intrinsic_matrix": np.array(MATRIX).T.ravel().tolist(),
-            },
-            (640, 480),
-            False,
-        ),
-        (
-            "d.yaml",  # ROS camera_calibration
-            {
-                "image_width": 640,
-                "image_height": 480,
-                "camera_matrix": {"rows": 3, "cols": 3, "data": np.ravel(MATRIX).tolist()},
-                "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.1, 0, 0, 0, 0]},
-            },
-            (640, 480),
-            True,
-        ),
-        ("e.json", {"K": MATRIX}, None, False),
-        (
-            "k.json",  # one by one
-            {"fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5, "k1": 0.0, "k2": 0, "p1": 0.001},
-            None,
-            True,
-        ),
-        ("l.json", {"K": MATRIX, "k1": 0, "p2": 0.0}, None, False),
-        (
-            "h.json",  # size and lens about the numbers
-            {
-                **{"width": 640, "height": 480, "D": [0.1, 0, 0, 0]},
-                "intrinsics": {"fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5},
-            },
-            (640, 480),
-            True,
-        ),
-        (
-            "i.yaml",  # rostopic echo camera_info, and Ctrl-C in the second message
-            f"---\nheight: 480\nwidth: 640\nD: [0.0, 0.0]\nK: {np.ravel(MATRIX).tolist()}\n"
-            "---\nheight: 480\nwid",
-            (640, 480),
-            False,
-        ),
-        (
-            "j.json",  # Open3D's camera with its pose
-            {
-                "extrinsic": [1, 0, 0, 0],
-                "intrinsic": {
-                    **{"width": 640, "height": 480},
-                    "intrinsic_matrix": np.array(MATRIX).T.ravel().tolist(),
-                },
-            },
-            (640, 480),
-            False,
-        ),
-        ("k.json", {"cam_K": np.ravel(MATRIX).tolist(), "depth_scale": 1.0}, None, False),  # BOP
-        ("f.txt", "525 0 319.5\n0 526 239.5\n0 0 1\n", None, False),
-        ("g.txt", "525 0 319.5 0\n0 526 239.5 0\n0 0 1 0\n0 0 0 1\n", None, False),
+        (FOUR, None, False),
+        ({**SIZE, "fx": 525, "fy": 526, "ppx": 319.5, "ppy": 239.5, "coeffs": [0]}, SIZE, False),
+        ({**SIZE, "intrinsic_matrix": COLUMNS}, SIZE, False),  # Open3D
+        ({**ROS, "distortion_coefficients": {"data": [0.1, 0, 0, 0, 0]}}, SIZE, True),
+        ({"K": MATRIX, "k1": 0, "p2": 0.0}, None, False),
+        ({**FOUR, "k1": 0.0, "k2": 0, "p1": 0.001}, None, True),
+        ({**SIZE, "D": [0.1, 0, 0, 0], "intrinsics": FOUR}, SIZE, True),  # about the numbers
+        # rostopic echo camera_info, and Ctrl-C in the second message
+        (f"---\nheight: 480\nwidth: 640\nD: [0.0]\nK: {ROWS}\n---\nheight: 480\nwid", SIZE, False),
+        ({"extrinsic": [1], "intrinsic": {**SIZE, "intrinsic_matrix": COLUMNS}}, SIZE, False),
+        ({"cam_K": ROWS, "depth_scale": 1.0}, None, False),  # BOP
+        ("525 0 319.5\n0 526 239.5\n0 0 1\n", None, False),
+        ("525 0 319.5 0\n0 526 239.5 0\n0 0 1 0\n0 0 0 1\n", None, False),
     ],
 )
-def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, name, content, size, bent):
+def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, content, size, bent):
     text = content if isinstance(content, str) else json.dumps(content)
-    (tmp_path / name).write_text(text)
-    found = read_intrinsics(name, tmp_path)
+    (tmp_path / "a.yaml").write_text(text)
+    found = read_intrinsics("a.yaml", tmp_path)
     scale = 1.0 if "depth_scale" in text else None
-    assert found == Intrinsics(Pinhole(525, 526, 319.5, 239.5), size, bent, scale)
-    assert read_intrinsics("525,526,319.5,239.5").camera == found.camera
+    camera = Pinhole(525, 526, 319.5, 239.5)
+    assert found == Intrinsics(camera, (640, 480) if size else None, bent, scale)
+    assert read_intrinsics("525,526,319.5,239.5").camera == camera
+    np.save(tmp_path / "K.npy", np.array(MATRIX))
+    assert read_intrinsics(str(tmp_path / "K.npy")).camera == camera
 
 
 @pytest.mark.parametrize(

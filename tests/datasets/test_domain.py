@@ -76,13 +76,6 @@ def test_every_domain_opens_on_its_fixture(tmp_path, name):
     assert domain(name, tmp_path).open().sha256 == data.sha256
 
 
-def test_a_store_of_other_classes_is_refused(tmp_path):
-    fixtures.write_domain("own", tmp_path, SPLITS)
-    domain("own", tmp_path).open()
-    with pytest.raises(DataError):
-        domain("own", tmp_path, "classes=[cup,box]").open()
-
-
 def test_clean_twin_beside_the_published_files_is_of_its_own(tmp_path):
     fixtures.write_domain("specklenet10", tmp_path, SPLITS)
     published = domain("specklenet10", tmp_path).open()
@@ -94,15 +87,6 @@ def test_clean_twin_beside_the_published_files_is_of_its_own(tmp_path):
     assert clean.made_of.objects == "a fixture"
     again = domain("specklenet10", tmp_path).open()
     assert (again.sha256, str(again.made_of)) == (published.sha256, "published files")
-
-
-def test_incomplete_published_files_do_not_count_as_published(tmp_path):
-    fixtures.write_domain("modelnet10", tmp_path, SPLITS)
-    found = domain("modelnet10", tmp_path)
-    assert str(found.made_of(found.open())) == "published files, in other numbers"
-    exact = [f"expected_counts.{s}={[n] * 10}" for s, n in SPLITS.items()]
-    found = domain("modelnet10", tmp_path, *exact)
-    assert found.made_of(found.open()).published
 
 
 def test_changed_import_settings_are_noticed(tmp_path):

@@ -136,8 +136,7 @@ def test_scannet_needs_an_agreement(site, tmp_path, speckle):
         with pytest.raises(AgreementError, match="accept_terms=scannet"):
             get(site, "depthscannet10", tmp_path, accept_terms=word)
     assert list(tmp_path.iterdir()) == []
-    get(site, "depthscannet10", tmp_path, accept_terms="scannet", keep=False)
-    assert visible(tmp_path / "downloads") == []
+    get(site, "depthscannet10", tmp_path, accept_terms="scannet")
     need = {source.name for source in SOURCES.values() if source.agreement}
     assert need == {"depthscannet10", "scannet10", "pointda10"}
 
@@ -169,7 +168,7 @@ def test_archives_with_no_tree_or_several(site, tmp_path, tmp_path_factory):
     (tmp_path / "own.zip").write_bytes(zipped(folder))
     words = ["download", "specklenet10", f"into={tmp_path}", f"archive={tmp_path / 'own.zip'}"]
     assert main(words) == 1
-    assert main([*words, "root=noisy/", "keep=false"]) == 0
+    assert main([*words, "root=noisy/"]) == 0
     assert (tmp_path / "own.zip").exists()
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.datamodules.splits import lineage
 from qs3.datasets.domain import Domain
 from qs3.datasets.joined import Joined
 from qs3.errors import DataError, MissingDataError
@@ -59,17 +58,6 @@ def test_all_clouds_are_there_and_scans_of_an_object_are_called_so(tmp_path):
     assert [row.valid_points for row in rows] == [32, 32, 48, 48, 32]
     assert str(data.made_of) == "embedded catalogue, x and y, 2 datasets joined"
     assert not data.made_of.published
-
-
-def test_no_object_trains_and_validates(tmp_path):
-    ids = [f"{cls}/train/{i}" for cls in CLASSES for i in range(20)]
-    write(tmp_path / "a", ids)
-    write(tmp_path / "b", ids[10:])
-    data = joined(tmp_path, "a", "b").open()
-    train, validation = lineage(data.ids, data.labels)
-    objects = np.array([name.split("~")[0] for name in data.ids])
-    assert len(train) + len(validation) == len(data) == 70
-    assert not set(objects[train]) & set(objects[validation])
 
 
 def test_a_change_of_a_dataset_is_noticed_and_its_absence_is_none(tmp_path):

@@ -7,8 +7,7 @@ import pytest
 
 from qs3.classes import CLASSES
 from qs3.datasets.folders import ModelNetMeshes
-from qs3.meshes.io import load_mesh
-from tests.fixtures.modelnet import OTHERS, TEN, off_text, write_off_tree
+from tests.fixtures.modelnet import off_text, write_off_tree
 
 SPLITS = {"train": 2, "test": 1}
 ARRAYS = Path(__file__).parents[3] / "shared" / "data" / "modelnet10_points.npz"
@@ -36,36 +35,6 @@ def test_order_names_and_seeds(modelnet):
     assert len({row.seed for row in rows}) == 30
     assert {row.valid_points for row in rows} == {64}
     assert all(cloud.shape == (64, 3) and cloud.dtype == np.float32 for cloud in clouds.values())
-
-
-def test_pygs_dataset_opens_the_same_files_and_reads_the_same_meshes(modelnet):
-    """PyG makes no download: the folder is as it expects it."""
-    from torch_geometric.datasets import ModelNet
-
-    names = sorted([*TEN, *OTHERS])
-    for split in ("train", "test"):
-        data = ModelNet(str(modelnet), name="40", train=split == "train")
-        ours = {
-            item.where: load_mesh(Path(item.where))
-            for item in ModelNetMeshes(modelnet).items(CLASSES)
-            if item.row.split == split
-        }
-        matched = 0
-        for theirs in data:
-            name = names[int(theirs.y)]
-            if name in OTHERS:
-                continue
-            same = [
-                where
-                for where, mesh in ours.items()
-                if Path(where).parts[-3] == name
-                and mesh.vertices.shape == tuple(theirs.pos.shape)
-                and np.array_equal(mesh.vertices.astype("f4"), theirs.pos.numpy())
-                and np.array_equal(mesh.faces, theirs.face.T.numpy())
-            ]
-            assert len(same) == 1
-            matched += 1
-        assert matched == len(ours) == 10 * SPLITS[split]
 
 
 def test_a_cloud_depends_on_its_own_seed_only(modelnet, tmp_path):

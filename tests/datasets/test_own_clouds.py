@@ -62,20 +62,6 @@ def test_the_folder_says_the_split_and_a_name_where_no_folder_does(tmp_path: Pat
     ]
 
 
-def test_any_number_of_points(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    rng = np.random.default_rng(0)
-    large = rng.standard_normal((300, 3))
-    write(tmp_path / "bed" / "large.xyz", large)
-    write(tmp_path / "bed" / "small.xyz")
-    clouds, rows = CloudFolder(tmp_path, points=16, test_every=0).read(("bed",), tmp_path)
-    assert [row.valid_points for row in rows] == [300, 4]
-    assert {cloud.shape for cloud in clouds} == {(16, 3)}
-    assert (clouds[0][0] == large[0].astype("f4")).all()
-    assert len(np.unique(clouds[0], axis=0)) == 16
-    np.testing.assert_array_equal(clouds[1], np.tile(CLOUD, (4, 1)).astype("f4"))
-    assert "under 16 points" in caplog.text
-
-
 @pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])
 def test_up_is_a_rotation_to_z(tmp_path: Path, up: str) -> None:
     importer = CloudFolder(tmp_path, up=up)

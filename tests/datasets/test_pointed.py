@@ -104,19 +104,6 @@ def test_what_is_cut_off_covered_or_small_is_cautioned_and_still_there():
     assert one.cautions[0].words == f"{len(one.piece.points_m)} pixels with depth, fewer than 700"
 
 
-def test_two_things_with_one_number_are_cautioned_and_two_parts_of_one_are_not():
-    depth, mask = seen()
-    (both,) = point_out(depth, CAMERA, mask=mask > 0, up=ROOM.up_in_camera)
-    _, larger = point_out(depth, CAMERA, mask=mask, up=ROOM.up_in_camera)
-    np.testing.assert_array_equal(both.piece.points_m, larger.piece.points_m)
-    assert "several" in [caution.kind for caution in both.cautions]
-    parted = mask == 1
-    rows = np.flatnonzero(parted.any(axis=1))
-    parted[rows[len(rows) // 2]] = False  # a wire before it
-    (one,) = point_out(depth, CAMERA, mask=parted, up=ROOM.up_in_camera)
-    assert one.cautions == ()
-
-
 @pytest.mark.parametrize("off_deg", [0.0, 15.0, 30.0, 60.0])
 def test_an_up_that_the_planes_contradict_is_cautioned(off_deg):
     """Beyond 20 degrees, with what they say; the up that is given is used nevertheless."""

@@ -174,9 +174,3 @@ def test_edges_equal_brute_force(sizes, loop, columns):
     batch = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
     found = knn_graph(x, None if len(sizes) == 1 else batch, 6, loop=loop)
     assert [tuple(edge) for edge in found.T.tolist()] == slow_edges(x, batch, 6, loop)
-
-
-def test_edges_refuse_what_pyg_would_mix_up():
-    with pytest.raises(ValueError, match="sorted"):
-        knn_graph(torch.zeros(3, 3), torch.tensor([0, 1, 0]), 1)
-    assert knn_graph(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 2).shape == (2, 0)

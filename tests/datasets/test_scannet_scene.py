@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.datasets.scannet import Registration, Sightings, agreed, spread
+from qs3.datasets.scannet import Registration, agreed, spread
 from qs3.datasets.scannet_files import SensHeader
 from tests.datasets.rooms import BASE_FROM_COLOUR, BASE_FROM_DEPTH, rigid
 
@@ -63,16 +63,6 @@ def test_a_plane_falls_where_the_twin_says(scale):
     found = Registration(head, shape).mask_pixels(depth)
     np.testing.assert_array_equal(found, twin(head, depth, scale))
     assert (found >= 0).mean() > 0.7
-
-
-def test_points_in_the_world():
-    registration = Registration(header(BASE_FROM_DEPTH, BASE_FROM_COLOUR), COLOUR_SHAPE)
-    pose = rigid((10, 20, 30), (1, 2, 3))
-    depth = np.zeros(DEPTH_SHAPE, dtype=np.float32)
-    depth[5, 7] = 1.5
-    (point,) = registration.world(depth, depth > 0, pose)
-    local = [(7 - 19.5) / 40 * 1.5, (5 - 14.5) / 39 * 1.5, 1.5, 1]
-    np.testing.assert_allclose(point, (pose @ local)[:3])  # the pose is the depth camera's
 
 
 def test_what_the_colour_camera_cannot_see_gets_no_pixel():
@@ -156,13 +146,3 @@ def test_each_next_one_is_the_farthest(seed, n, count):
 def test_frames_at_one_place_are_all_taken_once():
     assert sorted(spread(np.ones((5, 3)), [1, 2, 2, 1, 1], 4)) == [0, 1, 2, 3]
     assert spread(np.zeros((2, 3)), [1, 1], 5) == [0, 1]
-
-
-def test_only_more_than_enough_points_make_a_sighting():
-    sightings = Sightings()
-    for frame, count in ((4, 999), (9, 1000), (12, 1001), (15, 1500)):
-        sightings.see(frame, np.full((count, 3), 0.5), np.array([frame, 0.0, 0.0]), 1000)
-    assert sightings.frames == [12, 15]
-    assert sightings.viewpoints(10) == (12, 15)
-    assert sightings.viewpoints(1) == (15,)
-    assert Sightings().viewpoints(10) == ()

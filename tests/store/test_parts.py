@@ -11,6 +11,7 @@ import pytest
 
 from qs3.errors import ConfigError, DataError
 from qs3.store.parts import PartFiles
+from tests.fixtures.harm import Harm
 
 
 def _zip(name: str, data: bytes) -> bytes:
@@ -18,6 +19,19 @@ def _zip(name: str, data: bytes) -> bytes:
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(name, data)
     return file.getvalue()
+
+
+def test_nothing_is_unpickled(tmp_path):
+    parts = PartFiles(tmp_path)
+    parts.begin({"a": 1})
+    parts.write("x", {"n": 1}, {"points": np.zeros(3)})
+    (path,) = tmp_path.rglob("x.npz")
+    with np.load(path, allow_pickle=False) as file:
+        harmful = {name: np.array(Harm(tmp_path / "harm"), dtype=object) for name in file.files}
+    np.savez(path, **harmful)
+    with pytest.raises(DataError):
+        parts.read("x")
+    assert not (tmp_path / "harm").exists()
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,13 @@ def test_split_is_a_view_and_keeps_order(tmp_path):
         data.split("validation")
 
 
+def test_split_of_scattered_rows(tmp_path):
+    rows = [ManifestRow(str(i), "bed", ("train", "test")[i % 2]) for i in range(4)]
+    points = np.arange(4)[:, None, None] + np.zeros((4, 2, 3))
+    data = make(tmp_path / "d", rows=rows, arrays={"points": points})
+    assert data.split("test").points[:, 0, 0].tolist() == [1, 3]
+
+
 def scattered(folder, labels="0120", splits="aaba"):
     """Clouds of three classes, of which each shows its number; split a is train, b is test."""
     names = ("bed", "chair", "table")
@@ -89,6 +96,19 @@ def test_evenly_is_at_even_steps_from_the_first_on():
     assert store.evenly(positions, 1) == [0]
     assert store.evenly(positions[:0], 4) == []
     assert all(type(each) is int for each in store.evenly(positions, 3))
+
+
+def test_the_table_of_counts_line_by_line(tmp_path):
+    data = scattered(tmp_path / "d", "0100" * 3, "aaba" * 3)
+    lines = store.counts_text(data, "failed", {"chair": 20})
+    assert [line.split() for line in lines] == [
+        ["clouds", "train", "test", "failed"],
+        ["bed", "6", "3", "0"],
+        ["chair", "3", "0", "20"],
+        ["all", "9", "3", "20"],  # no line for a class without anything
+    ]
+    assert len({len(line) for line in lines}) == 1  # numbers end below each other
+    assert lines[1].endswith(" 0")
 
 
 def test_clouds_of_a_dataset_cannot_be_put_in_place_of_others(tmp_path):

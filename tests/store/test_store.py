@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from qs3.errors import DataError, MissingDataError
+from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.store import store
 from qs3.store.store import ManifestRow, open_pointset, write_pointset
 
@@ -60,6 +60,18 @@ def test_round_trip(tmp_path):
     assert rows[1].reason == "empty mesh"
 
 
+def test_the_smallest_dataset(tmp_path):
+    """One point of one cloud of one class, beside an object that failed."""
+    rows = [
+        ManifestRow("bed/0", "bed", "train"),
+        ManifestRow("bed/1", "bed", "train", status="failed", reason="empty"),
+    ]
+    make(tmp_path / "d", classes=["bed"], arrays={"points": np.ones((1, 1, 3))}, rows=rows)
+    found = open_pointset(tmp_path / "d")
+    assert (found.classes, found.points.tolist()) == (("bed",), [[[1.0, 1.0, 1.0]]])
+    assert (found.meta["clouds"], found.meta["points"], found.meta["failed"]) == (1, 1, 1)
+
+
 def test_what_is_begun_is_not_finished(tmp_path):
     folder = tmp_path / "d"
     assert not store.is_begun(folder)
@@ -74,6 +86,18 @@ def test_what_is_begun_is_not_finished(tmp_path):
     make(folder)
     assert store.is_finished(folder)
     assert not store.is_begun(folder)
+
+
+def test_meta_as_people_read_it(tmp_path):
+    make(tmp_path / "d", meta={"zebra": "Größe", "apple": "word " * 30})
+    text = (tmp_path / "d" / "meta.yaml").read_text()
+    keys = [line.split(":")[0] for line in text.splitlines() if line[:1].isalpha()]
+    assert keys == [
+        *("format", "format_version", "created_by", "name", "classes", "clouds", "points"),
+        *("failed", "sha256", "zebra", "apple"),
+    ]  # nothing is said of tables where there are none
+    assert "Größe" in text
+    assert 90 < max(map(len, text.splitlines()[:-1])) <= 105  # folded at the first word after 100
 
 
 COLUMNS = ("u", "v", "w", "label")
@@ -183,6 +207,12 @@ def test_the_content_hash_is_that_of_its_definition(tmp_path):
     assert made.sha256 == hashlib.sha256(json.dumps(seen).encode("ascii")).hexdigest()
 
 
+def test_hundreds_of_clouds(tmp_path):
+    made = make(tmp_path, n=300, p=1)
+    assert open_pointset(tmp_path).ids == made.ids
+    assert len(made.points) == 300
+
+
 def test_unfinished_and_missing(tmp_path):
     with pytest.raises(MissingDataError):
         open_pointset(tmp_path / "d")
@@ -232,6 +262,12 @@ def test_wrong_input_is_refused_and_nothing_is_finished(tmp_path, changes):
     assert not store.is_finished(tmp_path / "d")
 
 
+def test_not_writable(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(Qs3Error):
+        make(tmp_path / "file" / "d")
+
+
 @pytest.mark.parametrize("file", ["points.npy", "manifest.csv", "meta.yaml"])
 def test_truncation_anywhere_is_noticed(tmp_path, file):
     make(tmp_path / "d", n=3, p=2)
@@ -262,6 +298,14 @@ def test_a_flipped_bit_anywhere_is_noticed(tmp_path, file):
             open_pointset(tmp_path / "d")
 
 
+def test_a_missing_file_is_named(tmp_path):
+    for file in ("points.npy", "manifest.csv"):
+        make(tmp_path / "d")
+        (tmp_path / "d" / file).unlink()
+        with pytest.raises(DataError):
+            open_pointset(tmp_path / "d")
+
+
 def test_other_peoples_array_in_place_of_ours(tmp_path):
     make(tmp_path / "d")
     path = tmp_path / "d" / "points.npy"
@@ -275,3 +319,13 @@ def test_other_peoples_array_in_place_of_ours(tmp_path):
         np.save(path, array)
         with pytest.raises(DataError, match=r"points\.npy"):
             open_pointset(tmp_path / "d", verify=False)
+
+
+def test_nan_on_disk_is_found_without_the_hash(tmp_path):
+    make(tmp_path / "d")
+    path = tmp_path / "d" / "points.npy"
+    data = bytearray(path.read_bytes())
+    data[-4:] = np.float32(np.nan).tobytes()
+    path.write_bytes(data)
+    with pytest.raises(DataError):
+        open_pointset(tmp_path / "d", verify=False)
