@@ -20,7 +20,6 @@ def view(
     match: Annotated[str, "only clouds with this in their names"] = "",
     up: Annotated[Literal["x", "y", "z", "-x", "-y", "-z"], "of files: what points up"] = "z",
     variant: Annotated[str, "of a dataset, such as points_clean"] = "",
-    residual: Annotated[bool, "of a dataset: distances to the surface, if known"] = True,
     data_dir: Annotated[Path | None, "of runs and domains: where their data are"] = None,
 ) -> int:
     """Clouds on a page where they can be turned.
@@ -47,7 +46,7 @@ def view(
     from qs3.report.view import view as page
     from qs3.utils.files import write_text
 
-    wanted = Wanted(match, up, variant, residual, data_dir, points)
+    wanted = Wanted(match, up, variant, data_dir, points)
     text, about, failed = page([path, *paths], clouds, colour, wanted)
     write_text(out, text)
     print(*about, *(f"not read: {words}" for words in failed), sep="\n")

@@ -242,15 +242,11 @@ def text(verdict: Verdict) -> str:
     lines = [
         verdict.about,
         *aligned(rows),
-        "Mean ± SEM over seeds; in brackets the interval at 95 %, with blocks of frames as clusters"
-        " and, of several runs, seeds; without ± over blocks alone.",
+        "Mean ± SEM over seeds; in brackets 95 % intervals over blocks of frames and seeds",
     ]
     mine = figures[figures.run == first]
     for _, f in mine[(mine.alone != "") & (mine.blocks > 1)].iterrows():
-        lines.append(
-            f"(!) {f.alone} ({f.tier}) lie in one block alone: these balanced intervals are too "
-            "narrow"
-        )
+        lines.append(f"(!) {f.alone} ({f.tier}) lie in one block alone: intervals are too narrow")
     every = figures[figures.tier == "all"]
     lines += [f"data of {f.run}: {f['data']}" for _, f in every.iterrows() if f["data"]]
     classes = [["class", *mine.tier, *every.run]]

@@ -38,7 +38,7 @@ class RunFiles:
         predictions: None if there are none yet.
         classes: names in label order.
         config: as composed, not resolved; None if Hydra did not write it.
-        command: that started the run; None likewise.
+        command: that started the run.
     """
 
     folder: Path
@@ -47,7 +47,7 @@ class RunFiles:
     predictions: Predictions | None
     classes: tuple[str, ...]
     config: Mapping[str, Any] | None
-    command: str | None
+    command: str
 
     @property
     def title(self) -> str:
@@ -85,7 +85,7 @@ def read_run(folder: str | Path) -> RunFiles:
     if (folder / PREDICTIONS).is_file():
         predictions = read_predictions(folder / PREDICTIONS)
     classes = tuple(metrics.final.predicted) if metrics else ()
-    hydra: dict[str, Any] = dict.fromkeys(("config", "overrides"))
+    hydra: dict[str, Any] = {"config": None, "overrides": ()}
     try:
         if (folder / HISTORY).is_file():
             history = pd.read_csv(folder / HISTORY)
@@ -95,8 +95,7 @@ def read_run(folder: str | Path) -> RunFiles:
                 hydra[name] = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
     except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
         raise DataError(f"{folder}: {HISTORY} or .hydra is damaged ({error})") from error
-    words = hydra["overrides"]
-    command = None if words is None else shlex.join(["python", "train.py", *map(str, words)])
+    command = shlex.join(["python", "train.py", *map(str, hydra["overrides"])])
     return RunFiles(folder, metrics, history, predictions, classes, hydra["config"], command)
 
 

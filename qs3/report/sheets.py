@@ -68,7 +68,7 @@ def class_sheet(data: PointSet, split: str, heading: str = "") -> Figure:
     )
 
 
-def scan_picture(domains: Mapping[str, PointSet], split: str = "train", note: str = "") -> Figure:
+def scan_picture(domains: Mapping[str, PointSet], split: str = "train") -> Figure:
     """One object of each class as each domain has it, two classes a row.
 
     Where domains share ids (a cloud and its clean twin, surface samples of the same mesh) the
@@ -77,7 +77,6 @@ def scan_picture(domains: Mapping[str, PointSet], split: str = "train", note: st
     Args:
         domains: by column title, such as "S: SpeckleNet10".
         split: which split the objects come from.
-        note: a line below all.
     """
     sets = [data.split(split) for data in domains.values()]
     classes = sets[0].classes
@@ -88,7 +87,7 @@ def scan_picture(domains: Mapping[str, PointSet], split: str = "train", note: st
         for cloud in _same_object(sets, cls):
             clouds.append(cloud)
             titles.append(cls if cloud is not None else f"no {cls}")
-    return contact_sheet(clouds, titles, 2 * len(sets), heads=[*domains] * 2, note=note)
+    return contact_sheet(clouds, titles, 2 * len(sets), heads=[*domains] * 2)
 
 
 def _same_object(sets: Sequence[PointSet], cls: str) -> list[np.ndarray | None]:

@@ -34,7 +34,6 @@ class Wanted:
     match: str = ""
     up: str = "z"
     variant: str = ""
-    residual: bool = True
     data_dir: Path | None = None
     points: int | None = None
 
@@ -59,10 +58,9 @@ def _part(path: str, most: int, wanted: Wanted) -> Part:
     if is_finished(place) or (not place.exists() and path in choices("domain")):
         given = {"variant": wanted.variant, "paths.data_dir": str(wanted.data_dir or "")}
         opened = open_named(path, {key: value for key, value in given.items() if value})
-        return part_of(opened, chosen(opened.data, most, wanted.match), wanted.residual)
+        return part_of(opened, chosen(opened.data, most, wanted.match))
     if is_run(place):
-        run = read_run(place)
-        return worst_clouds(run, most, wanted.match, wanted.data_dir, wanted.residual)
+        return worst_clouds(read_run(place), most, wanted.match, wanted.data_dir)
     if not place.exists():
         raise MissingDataError(f"{path} is neither there nor the name of a domain")
     return _archive(place, most, wanted) if is_archive(place) else _files(place, most, wanted)

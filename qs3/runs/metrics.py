@@ -92,7 +92,7 @@ class Evaluated:
         rotations: rotations about the up axis over which the further scores average; 0: none.
         norms: "trained", "adabn", "alpha_bn" or "tent".
         prior: how common classes counted as, in words; "": as in training.
-        prior_shares: the same as numbers, of sum 1; None without, and in files of older versions.
+        prior_shares: the same as numbers, of sum 1; None without.
         final_over_rotations, warmup_over_rotations: those scores.
         tiers: the final scores of the clouds of each tier, for datasets that have tiers ("clean",
             "hard": how much of the object is seen) and labels.
@@ -164,10 +164,7 @@ class Quality:
     """What can be said of the reported net on the evaluated clouds without their labels.
 
     Attributes:
-        clouds: that were evaluated.
-        validated_on: whose held-out labelled clouds it was measured on, such as "source_val".
-        validation_clouds: how many.
-        validation_accuracy: on them.
+        validation_accuracy: on held-out labelled clouds.
         expected: accuracy by `qs3.evaluation.expected`, of the net before self-training if there
             was any, with the norms it was trained with: what adapts a net to clouds makes it surer
             of them. None of a net that has diverged, and of few clouds.
@@ -175,9 +172,6 @@ class Quality:
         never_predicted: classes.
     """
 
-    clouds: int
-    validated_on: str
-    validation_clouds: int
     validation_accuracy: float
     expected: float | None = None
     unlike_source: float
@@ -198,7 +192,6 @@ class DataHashes:
 
     source: str
     target: str
-    beside: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -310,10 +303,7 @@ def read_metrics(folder: str | Path) -> RunMetrics | None:
         return None
     except (OSError, ValidationError) as error:
         why = error if isinstance(error, OSError) else problems(error)
-        raise DataError(
-            f"{path} is damaged ({why}); delete it and repeat the run's command, which trains "
-            "nothing again"
-        ) from error
+        raise DataError(f"{path} is damaged ({why}); delete it and repeat the command") from error
 
 
 def write_metrics(folder: str | Path, metrics: RunMetrics) -> None:

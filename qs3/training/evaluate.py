@@ -227,9 +227,6 @@ def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
     known = held_out(nets.of_validation(before, TRAINED), labels)
     counts = np.bincount(table.argmax(axis=1), minlength=len(classes))
     return Quality(
-        clouds=len(table),
-        validated_on=f"{data.owner}_val",
-        validation_clouds=len(labels),
         validation_accuracy=float((nets.of_validation(file).argmax(axis=1) == labels).mean()),
         expected=expected_accuracy(known, nets.of_test(before, norms=TRAINED)),
         unlike_source=ood_share(loaded.evaluation.test.clouds, data.all_labelled),

@@ -104,7 +104,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
         validators=outcome.validators,
         quality=outcome.quality,
         training=outcome.training,
-        data=DataHashes(**loaded.started["data"], beside=loaded.started.get("beside", "")),
+        data=DataHashes(**loaded.started["data"]),
         made_of=loaded.made_of,
         times=built.clock.taken(),
         versions=_versions(loaded.started),

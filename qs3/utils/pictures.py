@@ -119,7 +119,6 @@ def sheet(
     heading: str = "",
     rows: Sequence[str] = (),
     heads: Sequence[str] = (),
-    note: str = "",
     panel_in: float = 1.45,
 ) -> Figure:
     """A figure of images in rows and columns, scaled to squares of one size.
@@ -128,7 +127,7 @@ def sheet(
         images: row by row; None leaves a place empty.
         titles: one below each image.
         columns: images in a row.
-        heading, note: a line above all, and one below all.
+        heading: a line above all.
         rows, heads: what stands before each row and above each column.
         panel_in: side of a square, inches.
     """
@@ -142,7 +141,7 @@ def sheet(
     for first in range(0, len(images), columns):
         lines = 1 + max(title.count("\n") for title in titles[first : first + columns])
         tops.append(tops[-1] + side + round((0.1 + 0.018 * size * lines) * _DPI))
-    high = tops[-1] + round(0.28 * _DPI * bool(note))
+    high = tops[-1]
     wide = left + columns * side + round(0.05 * _DPI)
     canvas = np.full((high, wide, 3), _rgb(PAPER), dtype=np.uint8)
     figure = blank(wide / _DPI, high / _DPI, _DPI)
@@ -167,7 +166,6 @@ def sheet(
         words = textwrap.fill(head, round(18 * panel_in))
         write(left + (column + 0.5) * side, tops[0] - 0.2 * _DPI, words, 8, INK)
     write(wide / 2, 0.24 * _DPI, heading, 11, INK, weight="bold")
-    write(wide / 2, high - 0.14 * _DPI, note, 8, SOFT)
     axes = figure.add_axes((0, 0, 1, 1))  # not figimage: notebooks show no figure without axes
     axes.set_axis_off()
     axes.imshow(canvas, aspect="auto", interpolation="nearest")

@@ -60,9 +60,6 @@ def metrics(seed=0, accuracy=0.5, **changes):
         "validators": {"infomax": 0.5},
         "quality": Quality(
             validation_accuracy=0.9,
-            clouds=200,
-            validated_on="source_val",
-            validation_clouds=40,
             unlike_source=0.1,
             never_predicted=[],
         ),

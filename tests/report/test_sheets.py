@@ -30,8 +30,8 @@ def test_same_object_in_all_domains_where_possible(tmp_path):
     beds = sheets._same_object([a, b, c], "bed")
     for found, (data, index) in zip(beds, [(a, 1), (b, 0), (c, 0)], strict=True):
         np.testing.assert_array_equal(found, data.points[index])
-    titles = words(sheets.scan_picture({"A": a, "B": b, "C": c}, note="n"))
-    assert {"A", "B", "C", "n", "bed", "chair", "no chair", "sofa", "no sofa"} <= {*titles}
+    titles = words(sheets.scan_picture({"A": a, "B": b, "C": c}))
+    assert {"A", "B", "C", "bed", "chair", "no chair", "sofa", "no sofa"} <= {*titles}
 
 
 def test_a_class_sheet_has_a_row_a_class(tmp_path):

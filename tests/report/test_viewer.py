@@ -44,10 +44,6 @@ def test_coordinates_are_off_by_half_a_step_at_most(rows, scale):
     assert found["radius"] == pytest.approx(farthest or 1.0)
 
 
-def test_fifty_clouds_of_2048_points_are_about_a_megabyte():
-    assert len(of(*[one(f"chair/{i}", 2048, label="chair") for i in range(50)])) < 900_000
-
-
 class Tags(HTMLParser):
     def __init__(self, text):
         super().__init__()

@@ -36,14 +36,12 @@ class Compared:
             missing.
         why: "" or the reason.
         clusters: what clouds of one cluster share, see `results.MESHES`.
-        simulated: whether a target is.
     """
 
     name: str
     subsets: Mapping[str, Pair] = field(default_factory=dict)
     why: str = ""
     clusters: str = MESHES
-    simulated: bool = False
 
 
 def row_of(table: Table, word: str) -> str:
@@ -114,14 +112,11 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
     The rows are taken as given: the interval is over seeds and clusters, as for one pair.
     """
     cells = [cell for pair in pairs for cell in pair]
-    simulated = any(cell.simulated for cell in cells)
     try:
         found = _why_not(cells) or _difference(cells)
     except DataError as error:
         found = str(error)
-    if isinstance(found, str):
-        return Compared(name, why=found, simulated=simulated)
-    return Compared(name, *found, simulated=simulated)
+    return Compared(name, why=found) if isinstance(found, str) else Compared(name, *found)
 
 
 def _seeds(cells: Sequence[Cell]) -> list[int]:

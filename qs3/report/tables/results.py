@@ -345,7 +345,6 @@ def summarise(folders: Sequence[Path], settings: Mapping[Path, str] | None = Non
         if first is not None and not first.labelled:
             notes.append(f"{name}: no target labels, so no accuracy")
         notes += [f"{name}, {said}" for said in runs.problems]
-    if any("(!)" in row[-2] for row in rows):
-        notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
+    notes += [f"(!) fewer than {FEW_SEEDS} seeds"] * any("(!)" in row[-2] for row in rows)
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
     return "\n".join([caption, *aligned(rows), *notes, *data_lines(lines)])

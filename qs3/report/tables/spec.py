@@ -176,12 +176,7 @@ def _row(row: Mapping[str, Any], spec: Mapping[str, Any]) -> dict[str, Any]:
 def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """The overrides of each column, in the order of `words`.
 
-    report.pictures=false                      all columns
-    R->A:data.target.published.file=FILE       the column "R → A" alone
-    R->A,R->A0:data.target.published.file=FILE two columns
-
-    Raises:
-        ConfigError: a word is for columns of which there are none.
+    A word such as "R->A,R->A0:data.target.published.file=FILE" is for these columns alone.
     """
     found: dict[str, list[str]] = {column: [] for column in columns}
     for word in words:
@@ -207,10 +202,7 @@ def chosen(names: Iterable[str], words: Sequence[str], place: str = "") -> list[
         exact = [name for name in names if _plain(name) == _plain(word)]
         found = exact or [name for name in names if _plain(word) in _plain(name)]
         if not found:
-            known = ", ".join(map(repr, names))
-            raise ConfigError(
-                f"{place}nothing is called {word!r} or contains it; there are {known}"
-            )
+            raise ConfigError(f"{place}no name has {word!r}; there are {', '.join(names)}")
         meant.update(found)
     return [name for name in names if name in meant]
 

@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pandas as pd
 from omegaconf import DictConfig
@@ -34,12 +34,8 @@ from qs3.report.tables.results import (
 from qs3.report.tables.spec import Entry, Metric, by_column, chosen, read_spec
 
 METRICS: Mapping[Metric, str] = {
-    "accuracy": "accuracy %",
-    "balanced_accuracy": "balanced accuracy %",
-    "accuracy_clean": "accuracy, clean %",
-    "accuracy_hard": "accuracy, hard %",
-    "balanced_accuracy_clean": "balanced accuracy, clean %",
-    "balanced_accuracy_hard": "balanced accuracy, hard %",
+    name: re.sub("_(clean|hard)", r", \1", name).replace("_", " ") + " %"
+    for name in get_args(Metric)
 }
 INCOMPLETE = "†"
 """Marks a number that lacks a seed which failed or is not finished."""

@@ -12,7 +12,6 @@ from qs3.errors import ConfigError, DataError
 from qs3.report.tables.results import (
     Runs,
     Stat,
-    data_lines,
     frame,
     load_runs,
     read_kept,
@@ -143,14 +142,6 @@ def test_summary_of_a_multirun(tmp_path):
     assert lines[5] == "exp ff00: no target labels, so no accuracy"
     assert lines[6] == f"exp ff00, seed 1: no result ({tmp_path / 'exp' / 'seed1-ff00'})"
     assert lines[7] == "(!) fewer than 3 seeds"
-
-
-def test_data_of_one_name_have_a_line_each(tmp_path):
-    """As two folders of own clouds, which have one name."""
-    made = DataMadeOf(source=replace(CATALOGUE, objects="others"), target=CATALOGUE)
-    write_run(tmp_path, source="own", target="own", made_of=made)
-    lines = [f"data: own (source): {made.source}", f"data: own (target): {made.target}"]
-    assert data_lines(runs(tmp_path).finished) == lines
 
 
 def test_a_kept_file_that_cannot_be_read(tmp_path):
