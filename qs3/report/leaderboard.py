@@ -73,20 +73,10 @@ def check_row(table: Table, name: str) -> None:
 
 
 def first_row(table: Table, name: str) -> Table:
-    """The row `name` first, and below it the rows with runs; of the columns those with some."""
+    """The row `name` first, and below it the rows with runs."""
     rows = {name: table.rows[name]}
     rows |= {r: cells for r, cells in table.rows.items() if any(c and c.finished for c in cells)}
-    shown = [
-        i
-        for i in range(len(table.columns))
-        if not table.ours(i) or any((c := cells[i]) and c.runs for cells in rows.values())
-    ]
-    return replace(
-        table,
-        title=f"{table.title}: {name}",
-        columns=tuple(table.columns[i] for i in shown),
-        rows={row: tuple(cells[i] for i in shown) for row, cells in rows.items()},
-    )
+    return replace(table, title=f"{table.title}: {name}", rows=rows)
 
 
 def page(table: Table, name: str) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -51,7 +51,6 @@ class ScannedObject:
         cloud: [P, 3] float32, metres: fused and sampled, as training gets it.
         clean: [P, 3] float32 its clean twin, or None.
         mesh: as it stood before the sensor.
-        settings: of the recipe that made it, instantiated.
     """
 
     name: str
@@ -62,7 +61,6 @@ class ScannedObject:
     cloud: np.ndarray
     clean: np.ndarray | None
     mesh: Mesh
-    settings: Any
 
     def view(self, number: int) -> KeptView | None:
         """A view by its number; None where the domain has no sensor."""
@@ -155,7 +153,6 @@ def scan_object(
         cloud=made.arrays["points"],
         clean=made.arrays.get("points_clean"),
         mesh=recipe.placing.place(loaded, object_rng(cfg.seed, item.id, 0), item.id),
-        settings=recipe,
     )
 
 

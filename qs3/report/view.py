@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,15 +27,14 @@ from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import printable
 
 
-@dataclass(frozen=True)
-class Wanted:
+class Wanted(NamedTuple):
     """What is shown of each path; see `qs3 view --help`."""
 
-    match: str = ""
-    up: str = "z"
-    variant: str = ""
-    data_dir: Path | None = None
-    points: int | None = None
+    match: str
+    up: str
+    variant: str
+    data_dir: Path | None
+    points: int | None
 
 
 def view(
