@@ -2,9 +2,9 @@
 
 Tensors of torch's `meta` device have shapes but no values, so whatever asks for a value fails:
 `.item()`, `.tolist()`, `.cpu()`, `if tensor:`, indexing by a mask, `nonzero`, `bincount`. On a GPU
-all of these wait for it, as assignment by a mask does, which does not fail here: `Watch` notes it.
-And everything takes the paths that a GPU takes: on the CPU sampling and neighbours go through
-numpy, and nets through kernels made for its caches.
+all of these wait for it. (So does assignment by a mask, which passes here.) And everything takes
+the paths that a GPU takes: on the CPU sampling and neighbours go through numpy, and nets through
+kernels made for its caches.
 
 Operations are those that reach a device's dispatcher: a call is a kernel or a few. `Watch.kernels`
 leaves out views and allocations, which start none.
@@ -61,8 +61,7 @@ class Watch(TorchDispatchMode):
     Attributes:
         counts: how often each operation was called, on whatever device.
         kernels: calls on `meta` that would start a kernel.
-        carried: operations that have tensors of two devices, tensors made of numbers, and
-            assignments by a mask for which a GPU would have to count its places.
+        carried: operations that have tensors of two devices, and tensors made of numbers.
     """
 
     def __init__(self) -> None:
@@ -70,9 +69,7 @@ class Watch(TorchDispatchMode):
         self.counts: Counter[str] = Counter()
         self.kernels: Counter[str] = Counter()
         self.carried: list[str] = []
-        # Kept, so that no other tensor gets their place.
-        self._drawn: list[Tensor] = []
-        self._numbers: list[Tensor] = []
+        self._drawn: list[Tensor] = []  # kept, so that no other tensor gets their place
         self._constants = Constants(self.carried)
         self._autocast = patch.object(torch, "autocast", Autocast)
 
@@ -100,29 +97,7 @@ class Watch(TorchDispatchMode):
             self._drawn += [x for x in made if x.device.type == "cpu"]
         elif len({x.device for x in (*given, *made)}) > 1:
             self.carried.append(str(func))
-        name = _name(func)
-        if name == "scalar_tensor":
-            self._numbers += made
-        elif name in ("index_put", "index_put_") and self._counts_a_mask(*args, **(kwargs or {})):
-            self.carried.append(f"{func} by a mask")
         return result
-
-    def _counts_a_mask(
-        self, x: Tensor, indices: list[Tensor | None], values: Tensor, accumulate: bool = False
-    ) -> bool:
-        """Whether `x[indices] = values` asks where a mask is true; of a number it is masked_fill.
-
-        As `canDispatchToMaskedFill` in ATen/native/TensorAdvancedIndexing.h has it: one mask and
-        no other index, and a number, which there stays with the CPU.
-        """
-        given = [i for i in indices if i is not None]
-        if not any(i.dtype in (torch.bool, torch.uint8) for i in given):
-            return False
-        number = values.numel() == 1 and values.device.type == "cpu"
-        number |= any(values is n for n in self._numbers)
-        if torch._C._current_graph_task_id() != -1:  # the zero on a number's way back
-            number |= values.dim() == 0
-        return accumulate or len(given) > 1 or not number
 
 
 def _name(func: Any) -> str:

@@ -37,7 +37,7 @@ from qs3.kernels import compiled
 from qs3.kernels.device import exporting, lists_of, takes_triton
 from qs3.kernels.edge_norm import MOST_NEIGHBOURS, edge_maximum, edge_norm
 from qs3.kernels.matmul import linear
-from qs3.kernels.norms import active, normed, track, uses_batch
+from qs3.kernels.norms import active, normed, running, track, uses_batch
 from qs3.kernels.pointwise_max import max_over_members, max_over_rows
 
 _GATHERED = 1 << 20  # values gathered at once on the CPU: 4 MB in float32
@@ -176,9 +176,7 @@ def edge_conv(
         mean, var = _statistics(rows, flat, w1, e)  # [g, d]
         track(norm, mean[0] + centre[0, 0] @ w2.T, var[0], b * n * k)
     else:
-        assert norm.running_mean is not None
-        assert norm.running_var is not None
-        mean, var = norm.running_mean[None], norm.running_var[None]
+        mean, var = (held[None] for held in running(norm))
     h = norm.weight * torch.rsqrt(var + norm.eps)
     shift = norm.bias - h * mean
     if not uses_batch(norm) and _takes_maximum(x, weight, h, k):

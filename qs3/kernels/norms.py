@@ -91,6 +91,13 @@ def normed(norm: nn.Module, x: Float[Tensor, "b *places c"]) -> Float[Tensor, "b
     return norm(x.flatten(0, -2)).view(x.shape)
 
 
+def running(norm: _Norm) -> tuple[Tensor, Tensor]:
+    """Running mean and variance [C] of a plain norm that keeps them."""
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    return norm.running_mean, norm.running_var
+
+
 def uses_batch(norm: nn.Module) -> bool:
     """Whether a pass takes statistics of its input, rather than the running ones."""
     norm = active(norm)
@@ -126,9 +133,7 @@ def statistics(norm: nn.Module, mean: Tensor, var: Tensor, count: int) -> tuple[
     if uses_batch(norm):
         track(norm, mean.detach(), var.detach(), count)
         return mean, var
-    assert norm.running_mean is not None
-    assert norm.running_var is not None
-    return norm.running_mean, norm.running_var
+    return running(norm)
 
 
 @contextmanager
@@ -198,32 +203,27 @@ class _Pooled:
     """Mean and biased variance of a norm's input over all batches (Chan et al., 1979), float64."""
 
     def __init__(self, norm: _BatchNorm) -> None:
-        assert norm.running_mean is not None
-        assert norm.running_var is not None
-        self.norm, self.before = norm, (norm.running_mean.clone(), norm.running_var.clone())
-        self.total = 0
-        self.mean = torch.zeros_like(norm.running_mean, dtype=torch.float64)
+        mean, var = running(norm)
+        self.norm, self.before, self.total = norm, (mean.clone(), var.clone()), 0
+        self.mean = torch.zeros_like(mean, dtype=torch.float64)
         self.squares = torch.zeros_like(self.mean)  # sum of squares about the mean
 
     def add(self, count: int) -> None:
         """What the norm holds after a pass with momentum 1: this batch's mean and variance."""
-        norm = self.norm
-        assert norm.running_mean is not None
-        assert norm.running_var is not None
-        step = norm.running_mean.double() - self.mean
+        mean, var = running(self.norm)
+        step = mean.double() - self.mean
         total = self.total + count
-        self.squares += norm.running_var.double() * (count - 1)
+        self.squares += var.double() * (count - 1)
         self.squares += step.square() * (self.total * count / total)
         self.mean += step * (count / total)
         self.total = total
 
     def store(self, kept: float) -> None:
-        norm = self.norm
-        assert norm.running_mean is not None
-        assert norm.running_var is not None
-        mean, var = self.before
-        norm.running_mean.copy_(self.mean.lerp(mean.double(), kept))
-        norm.running_var.copy_((self.squares / max(self.total - 1, 1)).lerp(var.double(), kept))
+        new_var = self.squares / max(self.total - 1, 1)
+        for held, new, old in zip(
+            running(self.norm), (self.mean, new_var), self.before, strict=True
+        ):
+            held.copy_(new.lerp(old.double(), kept))
 
 
 @torch.no_grad()

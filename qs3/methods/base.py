@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 Weight = Annotated[float, Ge(0)]  # of a loss; 0 switches it off
 Share = Annotated[float, Interval(ge=0, le=1)]
+Batch = dict[str, Any]
+Terms = dict[str, Float[Tensor, ""]]  # of a loss, by name
 
 
 class Method(nn.Module):
@@ -60,9 +62,7 @@ class Method(nn.Module):
         """Modules that learn at another rate than `protocol.optimizer.lr`, and its factors."""
         return ()
 
-    def loss(
-        self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Float[Tensor, ""]]:
+    def loss(self, net: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms of the loss by name; their sum is minimised.
 
         Args:

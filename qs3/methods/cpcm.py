@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, Weight, class_loss
+from qs3.methods.base import Batch, Method, Terms, Weight, class_loss
 from qs3.utils.settings import checked
 
 
@@ -40,9 +40,7 @@ class Cpcm(Method):
         super().__init__()
         self.mix_weight = mix_weight
 
-    def loss(
-        self, net: Any, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce", >= 0, and "mixed", in [0, w]."""
         source, target = batch["source"]["points"], batch["target"]["points"]
         lam = torch.rand((), generator=generator, device=generator.device).to(source.device)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, Weight, check_taught, class_loss, feature_dims
+from qs3.methods.base import Batch, Method, Terms, Weight, check_taught, class_loss, feature_dims
 from qs3.models.base import ClassHead
 from qs3.utils.settings import checked
 
@@ -84,9 +84,7 @@ class Dann(Method):
             check_taught(net, "method=dann")
         self.domain_head = ClassHead(feature_dims(net)[0], 2, dropout=0.0)
 
-    def loss(
-        self, net: Any, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" and "domain", each >= 0; "domain" is 2 w_d ln 2 where d knows nothing."""
         alpha = dann_alpha(batch["progress"])
         source = net.features(batch["source"]["points"]).global_  # [B, D]

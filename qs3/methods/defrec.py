@@ -20,7 +20,7 @@ from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, Share, Weight, feature_dims
+from qs3.methods.base import Batch, Method, Share, Terms, Weight, feature_dims
 from qs3.methods.pcm import source_loss
 from qs3.models.base import Features
 from qs3.utils.settings import checked
@@ -168,9 +168,7 @@ class DefRec(Method):
         """The reconstruction head."""
         self.head = ReconstructionHead(net, self.dropout)
 
-    def loss(
-        self, net: Any, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" or "pcm", and "defrec" (and "defrec_source"), each >= 0."""
         source = batch["source"]
         name, supervised = source_loss(

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, Weight, check_taught, feature_dims
+from qs3.methods.base import Batch, Method, Terms, Weight, check_taught, feature_dims
 from qs3.methods.defrec import VOXELS, cloud_size, deform
 from qs3.methods.pcm import join, source_loss
 from qs3.utils.settings import checked
@@ -74,9 +74,7 @@ class Gast(Method):
         if self.rot_weight:
             self.rot_heads = nn.ModuleList(nn.Linear(width, _QUARTERS) for _ in range(2))
 
-    def loss(
-        self, net: Any, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" or "pcm", "def_source", "def_target", "rot_source", "rot_target"; >= 0.
 
         Where a head knows nothing, a "def" is w_d ln 27 and a "rot" w_r ln 4.

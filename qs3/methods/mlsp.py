@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from qs3.geometry.neighbours import gather, knn
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, Share, Weight
+from qs3.methods.base import Batch, Method, Share, Terms, Weight
 from qs3.methods.defrec import ReconstructionHead, cloud_size, deform, masked_mean, nearest
 from qs3.methods.pcm import source_loss
 from qs3.utils.settings import checked
@@ -72,9 +72,7 @@ class Mlsp(Method):
         """The head."""
         self.head = ReconstructionHead(net, self.dropout, 3 + 3 + CARDINALITIES)
 
-    def loss(
-        self, net: Any, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" or "pcm", "position", "normal" and "cardinality", each >= 0.
 
         Where the head knows nothing, "cardinality" is 2 w_c ln 16.

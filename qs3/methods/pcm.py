@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.geometry.neighbours import farthest_point_sampling, gather
-from qs3.methods.base import Method, class_loss
+from qs3.methods.base import Batch, Method, Terms, class_loss
 
 Labels = Int[Tensor, " b"] | Float[Tensor, "b c"]  # classes, or their probabilities
 
@@ -92,9 +92,7 @@ class Pcm(Method):
     warm-up of QS3.
     """
 
-    def loss(
-        self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
         """Mixed cross-entropy, >= 0."""
         source = batch["source"]
         mixed, labels_a, labels_b, lam = mix(source["points"], source["y_source"], generator)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, Weight, class_loss
+from qs3.methods.base import Batch, Method, Terms, Weight, class_loss
 from qs3.methods.dann import reverse_gradient, sine_alpha
 from qs3.models.base import check_points
 from qs3.utils.settings import checked
@@ -93,9 +93,7 @@ class PointDan(Method):
         """The classifiers learn faster."""
         return ((net.head, self.classifier_rate),)
 
-    def loss(
-        self, net: Any, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" >= 0, "discrepancy" in [-2 w_a / C, 0], "nodes" in [0, 10 w_n]."""
         assert self.attention is not None, "prepare() comes first"
         features, attended = {}, {}

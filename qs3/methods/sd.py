@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, Share, Weight, check_taught, class_loss
+from qs3.methods.base import Batch, Method, Share, Terms, Weight, check_taught, class_loss
 from qs3.utils.settings import checked
 
 
@@ -103,9 +103,7 @@ class Sd(Method):
         self.steps += 1
         move_towards(self.teacher, net, (1 / self.steps).clamp_min(1 - self.momentum))
 
-    def loss(
-        self, net: Any, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" and "consistency", each >= 0."""
         if batch.get("step_begins", True):
             self.follow(net)

@@ -6,12 +6,10 @@ error) nothing helped on real objects: docs/results/tried.md.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from qs3.methods.base import Method, Weight, class_loss
+from qs3.methods.base import Batch, Method, Terms, Weight, class_loss
 from qs3.utils.settings import checked
 
 
@@ -32,9 +30,7 @@ class Twin(Method):
         super().__init__()
         self.again_weight = again_weight
 
-    def loss(
-        self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, net: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" and "again", each >= 0."""
         source = batch["source"]
         ce, again = (

@@ -1,11 +1,10 @@
-"""Nets and methods: steps against straight networks of the authors' operations, in one process.
+"""Nets and methods: steps against the formulas of the layers as published, in one process.
 
 The figures of docs/reference/{backbones,accelerators}.md and docs/how-to/leaderboard.md.
 """
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,12 +15,11 @@ import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch import nn
 from torch.nn import functional as F
-from torch_geometric.nn import EdgeConv as PygEdgeConv
 
 from qs3.engine.cuda_graphs import EAGER, Graphs
-from qs3.geometry.neighbours import farthest_point_sampling, knn
+from qs3.geometry.neighbours import farthest_point_sampling
+from qs3.kernels import plain
 from qs3.methods.bounds import SourceOnly
-from qs3.models.dgcnn import EdgeConv
 from tests.benchmarks.timing import (
     DEVICE,
     ENABLED,
@@ -30,27 +28,13 @@ from tests.benchmarks.timing import (
     Pair,
     Step,
     compare,
-    deterministic,
     finish,
     seconds,
     show,
 )
-from tests.device import Watch
 from tests.methods.cases import CASES, Case, batch_of, total
-from tests.models.reference import NaiveDGCNN
-from tests.models.reference_pointnet import NaivePointNet
-from tests.models.reference_pointnet2 import StraightPointNet2
-from tests.models.reference_rscnn import NaiveRSCNN
-from tests.models.reference_simpleview import NaiveSimpleView
 from tests.models.test_all_nets import NETS, build
 
-STRAIGHT: dict[str, Any] = {
-    "dgcnn": NaiveDGCNN,
-    "pointnet": NaivePointNet,
-    "pointnet2": StraightPointNet2,
-    "rscnn": NaiveRSCNN,
-    "simpleview": NaiveSimpleView,
-}
 PUBLISHED = {"pointnet": 4212, "dgcnn": 402}  # clouds a second: PointNeXt's model zoo, V100
 on_gpu = pytest.mark.skipif(DEVICE.type != "cuda", reason="needs DEVICE=cuda")
 
@@ -81,32 +65,24 @@ def net_step(net: nn.Module, points: torch.Tensor, training: bool = True) -> Ste
     return train if training else infer
 
 
+def by_formula(step: Step) -> Step:
+    """The same step without our kernels."""
+
+    def run() -> None:
+        with plain():
+            step()
+
+    return run
+
+
 def of_net(name: str, b: int, n: int, some: int, training: bool = True, **settings: Any) -> Pair:
-    """The straight net takes `some` clouds on the CPU, as many as its memory likes."""
+    """The formulas take `some` clouds on the CPU, as many as their memory likes."""
     net = build(name, **settings).float().to(DEVICE)
-    straight = STRAIGHT[name](copy.deepcopy(net)).to(DEVICE)
     b, n = (b, n) if ENABLED else (2, 64)
     points = boxes(b, n).to(DEVICE)
     few = points[:some] if DEVICE.type == "cpu" else points
-    ours, theirs = net_step(net, points, training), net_step(straight, few, training)
-    return Pair(ours, theirs, "straight", (b, len(few)))
-
-
-def of_layer(c: int, d: int) -> Pair:
-    """One EdgeConv, forward and backward, on edges found beforehand, against PyG's."""
-    ours = EdgeConv(c, d).to(DEVICE)
-    mlp = nn.Sequential(nn.Linear(2 * c, d, bias=False), nn.BatchNorm1d(d), nn.LeakyReLU(0.2))
-    theirs = PygEdgeConv(mlp, aggr="max").to(DEVICE)
-    x = torch.randn(2, 1024 if ENABLED else 64, c).to(DEVICE).requires_grad_()
-    index = knn(x.detach(), 20)
-    first = (torch.arange(2, device=DEVICE) * x.shape[1])[:, None, None]
-    target = torch.arange(x.shape[1], device=DEVICE)[None, :, None] + first
-    pairs = torch.stack([(index + first).flatten(), target.expand_as(index).flatten()])
-    return Pair(
-        lambda: ours(x, index).sum().backward(),
-        lambda: theirs(x.flatten(0, 1), pairs).sum().backward(),
-        "PyG's",
-    )
+    ours, theirs = net_step(net, points, training), by_formula(net_step(net, few, training))
+    return Pair(ours, theirs, "by formula", (b, len(few)))
 
 
 def released_fps(points: np.ndarray, count: int, start: int = 0) -> np.ndarray:
@@ -134,17 +110,12 @@ def of_sampling() -> Pair:
 PAIRS: dict[str, Callable[[], Pair]] = {
     "DGCNN uda 16 x 1024": lambda: of_net("dgcnn", 16, 1024, 2),
     "DGCNN simpleview 16 x 1024": lambda: of_net("dgcnn", 16, 1024, 2, variant="simpleview"),
-    "DGCNN uda 32 x 256": lambda: of_net("dgcnn", 32, 256, 2),
     "PointNet 16 x 1024": lambda: of_net("pointnet", 16, 1024, 16),
     "PointNet++ ssg 16 x 1024": lambda: of_net("pointnet2", 16, 1024, 4, variant="ssg"),
     "PointNet++ msg 16 x 1024": lambda: of_net("pointnet2", 16, 1024, 4),
     "RS-CNN released 16 x 1024": lambda: of_net("rscnn", 16, 1024, 16),
-    "RS-CNN original 16 x 1024": lambda: of_net("rscnn", 16, 1024, 16, relation="original"),
     "SimpleView training 18 x 1024": lambda: of_net("simpleview", 18, 1024, 18),
     "SimpleView inference 18 x 1024": lambda: of_net("simpleview", 18, 1024, 18, training=False),
-    "EdgeConv 3 -> 64": lambda: of_layer(3, 64),
-    "EdgeConv 64 -> 128": lambda: of_layer(64, 128),
-    "EdgeConv 128 -> 256": lambda: of_layer(128, 256),
     "FPS 2048 -> 1024": of_sampling,
 }
 
@@ -188,23 +159,6 @@ def test_methods(capsys: pytest.CaptureFixture) -> None:
         show(capsys, *rows)
 
 
-def test_kernels_of_a_step(capsys: pytest.CaptureFixture) -> None:
-    """What a step of 16 x 1,024 points starts on an accelerator, counted anywhere."""
-
-    def kernels(net: nn.Module) -> int:
-        with Watch() as watch:
-            net_step(net.to("meta"), torch.empty(16, 1024, 3, device="meta"))()
-        return watch.kernels.total()
-
-    rows = ["| net | kernels | straight |", "|---|---|---|"]
-    for name in NETS if ENABLED else NETS[:1]:
-        straight = STRAIGHT[name](build(name).float()) if name in STRAIGHT else None
-        theirs = "-" if straight is None else str(kernels(straight))
-        rows.append(f"| {name} | {kernels(build(name).float())} | {theirs} |")
-    if ENABLED:
-        show(capsys, *rows)
-
-
 def test_clouds_a_second(capsys: pytest.CaptureFixture) -> None:
     b = 32 if ENABLED else 2
     points = boxes(b, 1024 if ENABLED else 64).to(DEVICE)
@@ -237,7 +191,7 @@ def _graph_step(net: Any, points: torch.Tensor) -> Step:
 @on_gpu
 def test_steps_with_graphs(capsys: pytest.CaptureFixture) -> None:
     rows = [
-        "| net | clouds | ms | graphs, ms | straight, ms | times faster | GB |",
+        "| net | clouds | ms | graphs, ms | by formula, ms | times faster | GB |",
         "|---" * 7 + "|",
     ]
     for name in NETS:
@@ -251,21 +205,6 @@ def test_steps_with_graphs(capsys: pytest.CaptureFixture) -> None:
             finish()
             shown = f"| {name} | {b} x {n} | {ours:.2f} | {graphs:.2f} |"
             peak = torch.cuda.max_memory_allocated() / 1e9
-            theirs = float("nan")
-            if name in STRAIGHT:
-                straight = STRAIGHT[name](build(name).float()).to(DEVICE)
-                theirs = 1e3 * seconds(net_step(straight, points), 20)
+            theirs = 1e3 * seconds(by_formula(net_step(net, points)), 20)
             rows.append(f"{shown} {theirs:.2f} | {theirs / graphs:.1f} | {peak:.2f} |")
     show(capsys, WHERE, *rows)
-
-
-@on_gpu
-def test_what_determinism_costs(capsys: pytest.CaptureFixture) -> None:
-    rows = ["| `trainer.deterministic` | ms | graphs, ms |", "|---|---|---|"]
-    points = boxes(16, 1024).to(DEVICE)
-    for setting in ("warn", False):
-        net = build("dgcnn").float().train().to(DEVICE)
-        with deterministic(setting):  # type: ignore[arg-type]
-            found = [seconds(way(net, points), 20) for way in (net_step, _graph_step)]
-        rows.append(f"| {setting} | {1e3 * found[0]:.2f} | {1e3 * found[1]:.2f} |")
-    show(capsys, f"DGCNN, 16 x 1024, {WHERE}", *rows)

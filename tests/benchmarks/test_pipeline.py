@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,17 +16,14 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 import qs3
 from qs3.catalogue import Catalogue
-from qs3.config.compose import composed
-from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.clouds import Labelled, prepare
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datasets.domain import Domain
 from qs3.generation.camera_poses import AnchoredViews
-from qs3.generation.plan import mesh_items
-from qs3.generation.workers import Job, scan_one
 from qs3.geometry.cameras import Camera, Intrinsics
+from qs3.kernels import plain
 from qs3.meshes.placement import UnitCube
 from qs3.sensors.base import window_of
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
@@ -36,11 +32,9 @@ from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.benchmarks.test_nets import released_fps
 from tests.benchmarks.timing import DEVICE, ENABLED, Pair, Step, compare, seconds, show
-from tests.models.reference import NaiveDGCNN
 from tests.models.test_all_nets import build as build_net
 
 ROOT = Path(__file__).parents[2]
-CORES = 2
 pytestmark = pytest.mark.skipif(DEVICE.type != "cpu", reason="is of the CPU")
 
 
@@ -77,9 +71,9 @@ def of_renderers() -> Pair:
 
 
 def of_prediction() -> Pair:
-    """Clouds of 2,048 points to probabilities of DGCNN, against loops and a straight net."""
+    """Clouds of 2,048 points to probabilities of DGCNN, against loops and its formulas."""
     clouds = np.random.default_rng(0).normal(size=(64 if ENABLED else 2, 2048, 3))
-    predictor, straight = qs3.load("dgcnn-speckle"), NaiveDGCNN(build_net("dgcnn").float()).eval()
+    predictor, net = qs3.load("dgcnn-speckle"), build_net("dgcnn").float()
     few = clouds[:8]
 
     def theirs() -> None:
@@ -87,11 +81,11 @@ def of_prediction() -> Pair:
             cloud = cloud - cloud.mean(0)
             cloud = cloud / np.linalg.norm(cloud, axis=1).max()
             chosen = torch.from_numpy(cloud[released_fps(cloud, 1024)]).float()
-            with torch.no_grad():
-                straight(chosen[None])
+            with torch.no_grad(), plain():
+                net(chosen[None])
 
     given = list(clouds.astype(np.float32))
-    return Pair(lambda: predictor(given), theirs, "straight", (len(clouds), len(few)))
+    return Pair(lambda: predictor(given), theirs, "by formula", (len(clouds), len(few)))
 
 
 PAIRS: dict[str, Callable[[], Pair]] = {
@@ -159,39 +153,10 @@ def test_loading(
     compare("loading, a cloud", pair, benchmark, capsys)
 
 
-@pytest.mark.timeout(3600)
-def test_materials(capsys: pytest.CaptureFixture) -> None:
-    """Processor time of a whole object of specklenet10, against one that is matt in even light."""
-    renderer = MitsubaRenderer(samples=16)
-    if renderer.variant.startswith("scalar_"):
-        pytest.skip("no compiled variant works here")
-    words = {"matt": (), "mixed": ("materials=mixed",), "area": ("materials=mixed", "light=area")}
-    found = {}
-    for name, more in words.items():
-        cfg = composed("generate", "domain=specklenet10", "renderer=mitsuba", "limit=1", *more)
-        job = Job(build(cfg.recipe), MitsubaRenderer, cfg.seed)
-        items = [item for item in mesh_items(cfg) if item.split == "train"]
-        spent = []
-        for item in [items[0], *items] if ENABLED else items[:1]:  # the first compiles kernels
-            begin = time.process_time()
-            assert scan_one(job, renderer, item).cloud is not None
-            spent.append(time.process_time() - begin)
-        found[name] = float(np.mean(spent[1:] or spent))
-    if ENABLED:
-        lines = [
-            f"{name}: {mean:.3f} core-seconds an object, {mean / found['matt']:.2f} of matt, "
-            f"{3600 * CORES / mean:,.0f} an hour on {CORES} cores"
-            for name, mean in found.items()
-        ]
-        show(capsys, *lines)
-
-
 COMMANDS = {
     "train.py --help": ("train.py", "--help"),
-    "train.py without data": ("train.py", "experiment=qs3_s2d"),
     "generate.py --help": ("generate.py", "--help"),
     "qs3 --help": ("-m", "qs3", "--help"),
-    "qs3 predict --help": ("-m", "qs3", "predict", "--help"),
     "import qs3": ("-c", "import qs3"),
 }
 

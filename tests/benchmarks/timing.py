@@ -8,11 +8,8 @@ from __future__ import annotations
 import os
 import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import pytest
 import torch
@@ -88,23 +85,3 @@ def finish() -> None:
     """Wait for what the device was asked for."""
     if DEVICE.type == "cuda":
         torch.cuda.synchronize(DEVICE)
-
-
-@contextmanager
-def deterministic(setting: bool | Literal["warn"]) -> Iterator[None]:
-    """Inside, torch is as Lightning's trainer sets it by `trainer.deterministic`."""
-    name = "CUBLAS_WORKSPACE_CONFIG"
-    before = torch.get_deterministic_debug_mode(), os.environ.get(name)
-    torch.use_deterministic_algorithms(bool(setting), warn_only=setting == "warn")
-    os.environ.pop(name, None)  # of a training in this process
-    if setting:
-        os.environ[name] = ":4096:8"
-    try:
-        with warnings.catch_warnings():  # which operation has no deterministic form
-            warnings.filterwarnings("ignore", message=".*deterministic", category=UserWarning)
-            yield
-    finally:
-        torch.set_deterministic_debug_mode(before[0])
-        os.environ.pop(name, None)
-        if before[1] is not None:
-            os.environ[name] = before[1]

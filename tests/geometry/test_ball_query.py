@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.geometry import ball_query as module
-from qs3.geometry.ball_query import ball_queries, ball_query
+from qs3.geometry.ball_query import ball_query
 
 
 def brute(x: torch.Tensor, c: torch.Tensor, radius: float, count: int) -> list[list[list[int]]]:
@@ -56,13 +56,3 @@ def test_equals_brute_force(
     else:
         found = ball_query(x, c, radius, count)
     assert found.tolist() == brute(x, c, radius, count)
-
-
-def test_blocks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    x = torch.randn(3, 50, 3)
-    whole = ball_queries(x, x[:, :20], [0.5, 1.0], [4, 9])
-    monkeypatch.setattr(module, "_CPU_BLOCK", 130)
-    for a, b in zip(whole, ball_queries(x, x[:, :20], [0.5, 1.0], [4, 9]), strict=True):
-        assert torch.equal(a, b)
-    for radius, count, expected in ((0.5, 4, whole[0]), (1.0, 9, whole[1])):
-        assert torch.equal(ball_query(x, x[:, :20], radius, count), expected)

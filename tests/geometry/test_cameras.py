@@ -61,13 +61,6 @@ def test_projection_is_that_of_a_pinhole(
         np.testing.assert_allclose(pixel[0], expected, rtol=1e-6, atol=1e-5)
 
 
-def test_a_point_in_the_camera_is_no_division_by_zero() -> None:
-    camera = Camera(Intrinsics.centred(3, 3, 1.0), np.eye(4))
-    pixel, depth = project(np.zeros((1, 3)), camera)
-    assert pixel.tolist() == [[1.0, 1.0]]
-    assert depth.tolist() == [0.0]
-
-
 def test_a_camera_moves_along_its_own_axes() -> None:
     camera = Camera(Intrinsics.centred(3, 3, 1.0), look_at(np.zeros(3), np.array([0.0, 1, 0])))
     moved = camera.moved((0.5, 0.25, 2.0))  # right is x, down is -z, forward is y

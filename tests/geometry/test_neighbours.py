@@ -5,7 +5,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.geometry import neighbours
 from qs3.geometry.neighbours import farthest_point_sampling, knn
 from qs3.kernels import compiled
 from tests.device import as_on_device
@@ -36,14 +35,6 @@ def test_smallest_sums_of_rows_that_are_mostly_equal(equal: int) -> None:
     assert torch.equal(values, sums)
     assert torch.equal(sums.gather(1, found), sums.sort(1)[0][:, :20])
     assert torch.equal(found, sums.sort(dim=1, stable=True)[1][:, :20])
-
-
-def test_knn_tree_and_dense_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    x = torch.randn(3, 300, 3, dtype=torch.float64)
-    dense = knn(x, 7)
-    monkeypatch.setattr(neighbours, "_TREE_FROM", 1)
-    assert torch.equal(knn(x, 7), dense)
-    assert torch.equal(knn(x, 1), dense[:, :, :1])
 
 
 def test_knn_with_k_above_n_starts_over() -> None:

@@ -49,15 +49,6 @@ def test_fps_with_ties_and_copies(total: int) -> None:
         assert_farthest(points, order)
 
 
-def test_fps_of_one_repeated_point_and_of_too_few() -> None:
-    same = np.ones((200, 3))
-    assert farthest_point_sampling_np(same, 200, 5)[0] == 5
-    assert sorted(farthest_point_sampling_np(same, 200, 5)) == list(range(200))
-    square = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], dtype=float)
-    assert farthest_point_sampling_np(square, 7).tolist() == [0, 2, 1, 0, 2, 1, 0]
-    assert farthest_point_sampling_np(square, 0).tolist() == []
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_unit_ball(dtype: type) -> None:
     points = (np.random.default_rng(0).standard_normal((4, 50, 3)) * 7 + 3).astype(dtype)

@@ -77,16 +77,3 @@ def test_rows_are_added_to_those_that_they_name(rows, k, among):
             expected[j] += x[i]
     for way in (edgeconv._added_to_neighbours, compiled.add_to_neighbours):
         torch.testing.assert_close(way(x, index), expected)
-
-
-def test_torchs_compiler_knows_them():
-    x, index = torch.randn(9, 4), edges(9, 9, 3)
-    best, where = compiled.neighbour_max(x, index)
-    checks = ("test_schema", "test_faketensor")
-    torch.library.opcheck(compiled.neighbour_max, (x, index), test_utils=checks)
-    torch.library.opcheck(compiled.neighbour_max_backward, (best, where, 9), test_utils=checks)
-    torch.library.opcheck(compiled.add_to_neighbours, (x, index), test_utils=checks)
-    of_layer = torch.randn(2, 9, 4), torch.randn(3, 4), torch.randn(2, 3), edges(9, 2, 3)
-    torch.library.opcheck(compiled.linear_max_backward, of_layer, test_utils=checks)
-    sums = torch.randn(6, 200), torch.randn(2, 200), 20
-    torch.library.opcheck(compiled.smallest_sums, sums, test_utils=checks)

@@ -10,7 +10,6 @@ from qs3.evaluation.norms import adapt_norms
 from qs3.kernels.norms import (
     DomainNorm,
     adapt_batchnorm,
-    begin_target_norms,
     track,
     use_domain,
     use_trained,
@@ -32,28 +31,6 @@ def _used(net: nn.Module, domain: str) -> set[str]:
     """Whose norms clouds of `domain` are served with."""
     with use_trained(net, domain):
         return {m.domain for m in net.modules() if isinstance(m, DomainNorm)}
-
-
-def test_target_norms_begin_with_the_source_s_once() -> None:
-    """So the net says of the target with the target's norms what it said with the source's."""
-    torch.manual_seed(0)
-    net = pointnet(4, norm="domain").double()
-    for seed in range(3):
-        net(_clouds(6, seed))
-    before = torch.from_numpy(predict(net, _clouds(5, 9), 5))  # target norms: never trained
-    begin_target_norms(net)
-    assert torch.equal(torch.from_numpy(predict(net, _clouds(5, 9), 5)), before)
-    with torch.no_grad(), use_domain(net.eval(), "target"):
-        said = net(_clouds(5, 9)).softmax(1)
-    torch.testing.assert_close(said, before)
-    net.train()(_clouds(6, 8))  # a pass on the source alone: the target's are behind
-    assert _used(net, "target") == {"source"}
-    begin_target_norms(net)
-    with use_domain(net, "target"):
-        net(_clouds(6, 7))
-    trained = copy.deepcopy(net.state_dict())
-    begin_target_norms(net)
-    assert all(torch.equal(value, trained[key]) for key, value in net.state_dict().items())
 
 
 @pytest.mark.parametrize("momentum", [0.1, None])

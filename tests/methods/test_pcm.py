@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from qs3.geometry.neighbours import farthest_point_sampling
 from qs3.methods.pcm import mix, pcm_loss
 
 
@@ -35,27 +34,6 @@ def test_proportions_and_labels(b: int, n: int, seed: int) -> None:
         assert all(
             (points[int(o), :] == p).all(1).any() for o, p in zip(owner[i], mixed[i], strict=True)
         )
-
-
-def test_parts_are_farthest_point_samples() -> None:
-    points, labels = _batch(3, 50)
-    for seed in range(5):
-        mixed, _, other, drawn = mix(points, labels, torch.Generator().manual_seed(seed))
-        lam = float(drawn)
-        for i in range(3):
-            if other[i] == i:
-                continue
-            owner = (mixed[i, :, 0] // 2).long()
-            for who, count in ((i, round(lam * 50)), (int(other[i]), 50 - round(lam * 50))):
-                part = {tuple(p) for p in mixed[i][owner == who].tolist()}
-                cloud = points[who]
-                samples = [
-                    {tuple(p) for p in cloud[order[:count]].tolist()}
-                    for order in farthest_point_sampling(
-                        cloud.expand(50, -1, -1), 50, torch.arange(50)
-                    )
-                ]
-                assert part in samples
 
 
 def test_pcm_loss_known_answer() -> None:

@@ -2,7 +2,6 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3.kernels.rsconv import relations
 from qs3.models.rscnn import group, rscnn
 from tests.models.by_formula import gradient_norm, set_weights, waves
 
@@ -26,24 +25,6 @@ def _line() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def test_members_of_a_ball(relation: str, slots: int, expected: list[int]) -> None:
     points, centres, index = _line()
     assert group(points, centres, index, 0.15, slots, relation)[0, 0].tolist() == expected
-
-
-@pytest.mark.parametrize(("relation", "s"), [("released", -0.1), ("paper", 1.2), ("original", 0.0)])
-def test_relation_vector(relation: str, s: float) -> None:
-    points, centres, index = _line()
-    slots = 4
-    found = group(points, centres, index, 0.15, slots, relation)
-    out = relations(points, centres, found, relation)
-    assert (out.count, out.slots) == (1, found.shape[2])
-    (balls,) = out.balls
-    assert balls.weight.sum() == found.shape[2]
-    members, weights, u = balls.index[0], balls.weight[0], balls.u[0]
-    assert {int(m): float(w) for m, w in zip(members, weights, strict=True) if w > 0} == {
-        int(m): float((found[0, 0] == m).sum()) for m in found[0, 0]
-    }
-    at = members.tolist().index(3)  # 0.1 to the right of the centre
-    expected = torch.tensor([0.1, s, 0, 0, 0.1, 0, 0, 1], dtype=torch.float64)
-    torch.testing.assert_close(u[at], expected)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from torch.nn import functional as F
 
 from qs3.models.simpleview import depth_images, simpleview
 from tests.models.by_formula import gradient_norm, set_weights, waves
-from tests.models.reference_simpleview import images_reference
 
 
 def _points(b: int = 3, n: int = 200) -> torch.Tensor:
@@ -32,10 +31,12 @@ def test_one_point_in_each_view(view: int, row: float, column: float, depth: flo
     assert image[tuple(where)].item() == pytest.approx(depth)
 
 
-def test_projection_equals_reference_with_overflowing_waves() -> None:
-    points = 1.5 * _points() + 0.2
-    images = depth_images(points, 64).flatten(0, 1)
-    torch.testing.assert_close(images, images_reference(points, 64), rtol=1e-12, atol=1e-12)
+def test_shared_pixel() -> None:
+    points = torch.tensor([[[0.0, 0, -0.4], [0, 0, 0.6]]])  # depths 1 and 2 in view 0
+    harmonic = depth_images(points, views=[0])
+    assert harmonic.max().item() == pytest.approx(2 / (1 + 1 / 2))
+    assert depth_images(points, views=[0], pixel="nearest").max().item() == pytest.approx(1)
+    assert (harmonic > 0).sum() == 1
 
 
 def test_up_turns_the_cloud() -> None:
