@@ -5,8 +5,6 @@ Light to import: renderers live in worker processes only.
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import time
 from collections import Counter
@@ -43,7 +41,6 @@ from qs3.store.manifest import MANIFEST
 from qs3.store.parts import (
     CLOUDS,
     CONFIG,
-    COSTS,
     INFRARED,
     PARTS,
     PartFiles,
@@ -114,7 +111,6 @@ def generate(cfg: DictConfig) -> PointSet:
         # The dataset last: with meta.yaml it counts as finished, and the parts can go.
         _draw(domain, items, outcomes)
         write_text(folder / CONFIG, OmegaConf.to_yaml(cfg, resolve=True))
-        write_text(folder / COSTS, _costs(outcomes))
         pointset = _write(plan, outcomes, recipe)
         parts.clear()
     _report(pointset, items, outcomes, time.perf_counter() - start)
@@ -252,16 +248,6 @@ def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome]) -> Non
     clouds_picture(domain.folder / CLOUDS, clouds, domain.label)
     if previews:
         infrared_picture(domain.folder / INFRARED, previews, domain.label)
-
-
-def _costs(outcomes: list[Outcome]) -> str:
-    """costs.csv. Not in manifest.csv, which is the same wherever the objects were scanned."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(("id", "seconds", "peak_memory_mb"))
-    for outcome in outcomes:
-        rows.writerow((outcome.item_id, f"{outcome.seconds:g}", f"{outcome.memory_mb:g}"))
-    return text.getvalue()
 
 
 class _Arrays(Sequence[np.ndarray]):

@@ -225,6 +225,13 @@ def _kept(number: int, arrays: dict[str, Any]) -> KeptView:
     return KeptView(number, frame, pose, believed)
 
 
+def _range(values: np.ndarray) -> tuple[float, float]:
+    """From where to where a picture's values are drawn: the middle 96 % of the finite ones."""
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, [2, 98]) if len(finite) else (0.0, 0.0)
+    return float(low), float(high)
+
+
 def view_picture(frame: DepthFrame) -> Figure:
     """Infrared image, disparity, depth and reasons side by side."""
     titles, images = [], []
@@ -234,8 +241,7 @@ def view_picture(frame: DepthFrame) -> Figure:
         ("depth", frame.depth_m, "viridis", "m"),
     ):
         if values is not None:
-            finite = values[np.isfinite(values)]
-            low, high = np.percentile(finite, [2, 98]) if len(finite) else (0.0, 0.0)
+            low, high = _range(values)
             titles.append(f"{name}, {low:.2f} to {high:.2f} {unit}")
             images.append(value_image(values, low, high, colours))
     reasons = np.zeros((*frame.reason.shape, 3), dtype=np.uint8)
@@ -295,25 +301,8 @@ def infrared_picture(path: Path, previews: Mapping[str, tuple[str, Arrays]], hea
     for cls, (_, pictures) in previews.items():
         for kind, (name, colours, unit) in _IMAGES.items():
             values = np.asarray(pictures.get(kind, np.full((3, 4), np.nan)), dtype=np.float64)
-            low, high = shown_range(values)
+            low, high = _range(values)
             images.append(value_image(values, low if unit else 0.0, high, colours))
             words = f" {low:.2f} to {high:.2f} {unit}" if unit and high > low else ""
             titles.append(f"{cls}: {name}{words}")
     save_png(sheet(images, titles, columns=6, heading=heading, panel_in=1.7), path, colours=256)
-
-
-def shown_range(image: np.ndarray) -> tuple[float, float]:
-    """From where to where an image is told apart: the object's range, whatever is stray.
-
-    The shortest interval that four fifths of the finite pixels lie in, and half as much more on
-    either side, within the middle 98 %.
-    """
-    values = np.sort(image[np.isfinite(image)])
-    if not len(values):
-        return 0.0, 0.0
-    within = -(-4 * len(values) // 5)
-    wide = values[within - 1 :] - values[: len(values) - within + 1]
-    begin = int(wide.argmin())
-    low, high = np.percentile(values, [1, 99])
-    more = wide[begin] / 2
-    return max(low, values[begin] - more), min(high, values[begin + within - 1] + more)

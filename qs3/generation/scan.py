@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qs3.config.hydra import build
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.generation.kept import Keep
 from qs3.generation.plan import planned
 from qs3.generation.recipes import Cloud
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     Solid = Mesh | trimesh.Trimesh | trimesh.Scene
-
-_OF_FILES = {"meshes": None, "keep_views": False, "scans": 1, "limit": None, "fraction": 1.0}
-"""Settings of datasets alone, as they are when they are not given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +86,6 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
         overrides: of generate.py, such as ["domain=specklenet10", "renderer=mitsuba"].
     """
     cfg = composed_recipe(overrides)
-    if given := [key for key, nothing in _OF_FILES.items() if cfg[key] != nothing]:
-        raise ConfigError(f"{given[0]}= is for datasets: meshes from memory are all scanned once")
     scanner = Scanner(cfg)
     return {name: _scan(scanner, name, solid, cfg) for name, solid in solids.items()}
 

@@ -12,10 +12,7 @@ import hashlib
 import logging
 import os
 import platform
-import resource
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -57,8 +54,6 @@ class Outcome:
         unavailable: its mesh is there no more: the dataset is not finished without it.
         note: what else its manifest row should state of an object that did not fail.
         saved: the worker has saved it (`Job.save`); then `cloud` is None here.
-        seconds: that the scan took.
-        memory_mb: the most that its process had taken by then.
     """
 
     item_id: str
@@ -69,8 +64,6 @@ class Outcome:
     unavailable: bool = False
     note: str = ""
     saved: bool = False
-    seconds: float = 0.0
-    memory_mb: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -99,16 +92,6 @@ class Job:
 
 def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
     """Make one object's cloud; failures of the object become an Outcome, not an error."""
-    begin = time.perf_counter()
-    outcome = _scan(job, renderer, item)
-    seconds = time.perf_counter() - begin
-    # In kilobytes, on macOS in bytes.
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    peak_mb = peak / (2**20 if sys.platform == "darwin" else 2**10)
-    return replace(outcome, seconds=round(seconds, 3), memory_mb=round(peak_mb, 1))
-
-
-def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
     sha256, lasting, unavailable = "", True, False
     try:
         mesh = item.load()
@@ -133,7 +116,6 @@ def save_part(parts: PartFiles, outcome: Outcome) -> None:
     cloud = outcome.cloud
     note = {
         **{key: getattr(outcome, key) for key in ("item_id", "mesh_sha256", "reason", "note")},
-        **{"seconds": outcome.seconds, "memory_mb": outcome.memory_mb},
         **{
             "views": cloud.views if cloud else 0,
             "valid_points": cloud.valid_points if cloud else 0,

@@ -7,7 +7,6 @@ The work is mostly a dataset, whose folder holds as well
 
     views/        images and depths of every view, if they were asked for
     clouds.png, infrared.png, config.yaml
-    costs.csv     seconds of each object, and the most memory that its process had taken by then
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from qs3.utils.files import (
 )
 
 RECIPE, PARTS, VIEWS = "recipe.json", "parts", "views"
-CLOUDS, INFRARED, CONFIG, COSTS = "clouds.png", "infrared.png", "config.yaml", "costs.csv"
+CLOUDS, INFRARED, CONFIG = "clouds.png", "infrared.png", "config.yaml"
 
 _MOST_LINES = 12
 
@@ -178,7 +177,7 @@ def delete_dataset(folder: Path) -> None:
     for name in (PARTS, VIEWS):
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
-    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG, COSTS)
+    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG)
     for path in [*(folder / name for name in names), *folder.glob("*.npy"), folder / RECIPE]:
         path.unlink(missing_ok=True)
 

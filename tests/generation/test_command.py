@@ -253,9 +253,9 @@ def test_kill_at_random_instants_changes_no_byte(meshes, tmp_path, victim, keep)
         for path in (tmp_path / "whole").rglob("*")
         if path.is_file()
     }
-    assert len(whole) == (10 if not keep else 11 + 9 * 2 * 2)
+    assert len(whole) == (9 if not keep else 10 + 9 * 2 * 2)
     for path, content in whole.items():
-        if path.name not in ("config.yaml", "costs.csv"):  # with the folder, and times
+        if path.name != "config.yaml":  # with the folder
             assert (tmp_path / path).read_bytes() == content, path
     assert not list((tmp_path / "specklenet10").rglob("*.tmp*"))
 

@@ -5,7 +5,6 @@ import pytest
 from PIL import Image
 
 from qs3.generation.command import generate
-from qs3.generation.kept import shown_range
 from qs3.store.store import open_pointset
 from tests.generation.generating import config, fingerprint
 
@@ -50,17 +49,5 @@ def test_force_takes_old_pictures_and_views_away(meshes, tmp_path):
     assert {path.name for path in folder.iterdir()} == {
         ".lock", "clouds.png", "config.yaml", "manifest.csv", "meta.yaml", "mine.txt", "points.npy",
         "recipe.json",
-        "costs.csv",
     }  # fmt: skip
     assert len(open_pointset(folder)) == 9
-
-
-def test_an_image_is_told_apart_where_the_object_is():
-    """One in ten of its pixels was matched with something else, anywhere in the search range."""
-    rng = np.random.default_rng(0)
-    values = rng.uniform(16, 18, 9000)
-    low, high = shown_range(np.concatenate([values, rng.uniform(1, 90, 1000)]))
-    assert low == pytest.approx(15.2, abs=0.4)
-    assert high == pytest.approx(18.8, abs=0.4)
-    assert shown_range(values) == pytest.approx(np.percentile(values, [1, 99]))
-    assert shown_range(np.array([3.0])) == (3, 3)

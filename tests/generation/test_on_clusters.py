@@ -148,9 +148,6 @@ def test_a_node_and_a_worker_are_killed(nodes, meshes, whole, tmp_path, shared):
     again = re.findall(r"(\d+) times? a \w+ (?:was lost|ended); what it had was done again", said)
     assert sum(map(int, again)) >= 2, said
     assert fingerprint(tmp_path / "specklenet10") == whole
-    costs = (tmp_path / "specklenet10" / "costs.csv").read_text().splitlines()
-    assert len(costs) == 1 + 45
-    assert all(float(line.split(",")[1]) > 0 for line in costs[1:])
 
 
 @slow

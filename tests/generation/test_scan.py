@@ -59,8 +59,6 @@ def _saved(folder):
     ("solid", "words", "error", "reason"),
     [
         (trimesh.Trimesh(), [], MeshError, "^object: "),
-        (BOX, ["meshes=x"], ConfigError, "meshes="),
-        (BOX, ["limit=5"], ConfigError, "limit="),
         (BOX, ["recipe.min_points=9999999"], DataError, "^object: "),
         (BOX, ["domain=scannet10"], ConfigError, "scannet10"),
     ],
