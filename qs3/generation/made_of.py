@@ -24,8 +24,6 @@ _MATERIALS = {
     "principled": "principled materials",
 }
 _LIGHTS = {"area": "light above", "bounced": "light between surfaces"}
-_MOST = 3  # settings are named
-_LENGTH = 40  # of a value that is named
 
 
 def made_of(plan: Plan, outcomes: Sequence[Outcome], recipe: Mapping[str, Any]) -> MadeOf:
@@ -128,9 +126,8 @@ def _named(
 
 
 def _with(name: str, changed: Sequence[str]) -> str:
-    """A name and its changed settings, some of many."""
-    more = f" and {len(changed) - _MOST} more" if len(changed) > _MOST else ""
-    return f"{name} with {' '.join(changed[:_MOST])}{more}" if changed else name
+    """A name and its changed settings."""
+    return f"{name} with {' '.join(changed)}" if changed else name
 
 
 def _differences(
@@ -145,8 +142,7 @@ def _differences(
         elif key not in given:
             yield place, f"no {place}"
         elif key not in file or value != other:
-            said = json.dumps(value).replace('"', "")
-            yield place, f"{place}={said if len(said) <= _LENGTH else said[:_LENGTH] + '...'}"
+            yield place, f"{place}={json.dumps(value)}".replace('"', "")
 
 
 def _plain(settings: DictConfig) -> dict[str, Any]:

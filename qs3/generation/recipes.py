@@ -22,7 +22,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
 from qs3.generation.kept import Keep, preview_of, provenance_of, save_view
 from qs3.generation.materials import Light, MixedMaterials
-from qs3.generation.released import PoseFile, box_of_corners
+from qs3.generation.released import PoseTable, ReleasedPlacing, ReleasedViews, box_of_corners
 from qs3.generation.scenes import Alone, Surroundings
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
 from qs3.meshes.mesh import Mesh
@@ -224,7 +224,7 @@ class Mesh2Point:
     min_view_points: Least = 1
     clean: bool = True
     min_clean_points: Least | None = None
-    poses: InstanceOf[PoseFile] | None = None
+    poses: InstanceOf[PoseTable] | None = None
     materials: InstanceOf[MixedMaterials] | None = None
     light: Light | None = None
     depth_errors: InstanceOf[DepthErrors] | None = None
@@ -233,8 +233,8 @@ class Mesh2Point:
 
     def __post_init__(self) -> None:
         if self.poses is not None:
-            object.__setattr__(self, "placing", self.poses.placing)
-            object.__setattr__(self, "views", self.poses.views(self.views.count))
+            object.__setattr__(self, "placing", ReleasedPlacing(self.poses))
+            object.__setattr__(self, "views", ReleasedViews(self.poses, self.views.count))
 
     def make(
         self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE

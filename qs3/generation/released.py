@@ -18,10 +18,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from annotated_types import Gt
 
 from qs3.classes import ALIASES, CLASSES
 from qs3.errors import ConfigError, DataError, MissingDataError
@@ -32,6 +31,7 @@ from qs3.utils.settings import settings
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # Blender's cameras look along -z with y up
 _SPLITS = ("train", "test")
+_MAX_ERROR_M = 0.01  # of the largest side from 1 m, and of the middle from the origin
 _CAMERA = {
     **{"camera_lens": 50.0, "camera_sensor_width": 36.0},
     **{"camera_shift_x": 0.0, "camera_shift_y": 0.0},
@@ -206,11 +206,9 @@ class ReleasedPlacing:
 
     Attributes:
         table: of all shapes.
-        max_error: how far the largest side may be from 1 m, and the middle from the origin (m).
     """
 
     table: PoseTable
-    max_error: float = 0.01
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str) -> Mesh:
         """A scaled, turned and moved copy; draws nothing."""
@@ -220,7 +218,7 @@ class ReleasedPlacing:
         c, s = np.cos(pose.yaw_rad), np.sin(pose.yaw_rad)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         middle = turn @ ((low + high) / 2 * pose.scale) + pose.location_m
-        if abs(side - 1) > self.max_error or np.abs(middle).max() > self.max_error:
+        if abs(side - 1) > _MAX_ERROR_M or np.abs(middle).max() > _MAX_ERROR_M:
             raise DataError(
                 f"this is not the mesh that was posed: its largest side is {side:.4g} m, not 1 m, "
                 f"or the middle of its box is at {middle.round(3)} m, not at the origin"
@@ -251,26 +249,9 @@ class ReleasedViews:
         return list(self.table.of(object_id).world_from_camera[: self.count])
 
 
-@dataclass(frozen=True, eq=False)
-class PoseFile:
-    """Poses from a file: takes the place of a recipe's own placing and views."""
-
-    table: PoseTable
-    max_error: float
-
-    @property
-    def placing(self) -> ReleasedPlacing:
-        """Puts objects where they were."""
-        return ReleasedPlacing(self.table, self.max_error)
-
-    def views(self, count: int) -> ReleasedViews:
-        """Puts `count` cameras where they were."""
-        return ReleasedViews(self.table, count)
-
-
-def pose_file(path: str | None, max_error: Annotated[float, Gt(0)] = 0.01) -> PoseFile | None:
+def pose_file(path: str | None) -> PoseTable | None:
     """The poses of a file (`read_poses`), to be sent on as a table; None without one."""
-    return None if path is None else PoseFile(read_poses(Path(path).expanduser()), max_error)
+    return None if path is None else read_poses(Path(path).expanduser())
 
 
 @settings

@@ -87,10 +87,6 @@ def load_mesh(path: str | Path, keep_colliders: bool = False, up: Up = "z") -> M
             vertices, faces = _READERS[suffix](path.read_bytes(), path.parent, colliders)
             if up == "y" and suffix not in DECLARE_UP:
                 vertices = vertices @ Y_UP_TO_Z_UP.T
-            if not len(faces):
-                raise MeshError(f"has no faces{colliders.exception}")
-            if not 0 <= faces.min() <= faces.max() < len(vertices):
-                raise MeshError(f"a face refers to a vertex that is not among the {len(vertices)}")
             mesh = Mesh(*without_strays(vertices, faces), colliders.count)
             if not _has_area(mesh):
                 raise MeshError("has no surface: all its faces have zero area")

@@ -38,7 +38,7 @@ class Mesh:
         faces = np.ascontiguousarray(self.faces, dtype=np.int32)
         assert vertices.shape[1:] == faces.shape[1:] == (3,)
         if len(faces) == 0:
-            raise MeshError("the mesh has no faces")
+            raise MeshError("has no faces, or those of colliders alone")
         if not np.isfinite(vertices).all():
             raise MeshError("a vertex is not finite")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -71,7 +71,7 @@ class Mesh:
             seen = [part for part in solids if part.metadata["node"] not in hidden]
             parts = [cls.from_trimesh(part) for part in seen if len(part.faces)]
             if not parts:
-                raise MeshError(f"has no faces{colliders.exception}")
+                raise MeshError("has no faces, or those of colliders alone")
             return replace(merge(parts), colliders=colliders.count)
         return cls(*without_strays(np.array(solid.vertices), np.array(solid.faces)))
 
@@ -206,8 +206,3 @@ class Colliders:
                 hidden.add(node)
             waiting += forest.children.get(node, ())
         return hidden
-
-    @property
-    def exception(self) -> str:
-        """What follows "has no faces" where colliders were left out."""
-        return f" but those of {self.count} colliders (colliders=keep)" if self.count else ""
