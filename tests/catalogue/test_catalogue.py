@@ -52,13 +52,6 @@ def test_a_split_uses_its_families_evenly():
             assert sum(counts) == 60  # hence no family of the other split
 
 
-def test_all_families_in_both_splits_on_demand():
-    items = Catalogue(train=40, test=40, classes=("lamp",), families="all").items()
-    for split in ("train", "test"):
-        used = {item.origin.split("/")[1] for item in items if item.split == split}
-        assert used == {family.name for family in families("lamp")}
-
-
 def test_every_class_has_families_for_both_splits():
     for cls in CLASSES:
         split = Counter(family.split for family in families(cls))

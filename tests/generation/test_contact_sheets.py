@@ -1,12 +1,11 @@
 """clouds.png and infrared.png: drawn from what was scanned, also after a resume."""
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from qs3.generation.command import generate
 from qs3.store.store import open_pointset
-from tests.generation.generating import config, fingerprint
+from tests.generation.generating import config
 
 
 def picture(path):
@@ -21,21 +20,6 @@ def test_a_finished_dataset_has_its_pictures_and_config(finished, meshes):
     assert pointset.meta["config"]["classes"] == ["chair", "table", "lamp"]
     assert pointset.meta["config"]["test_fraction"] == 0.2
     assert str(folder.parent) not in (folder / "meta.yaml").read_text()
-
-
-@pytest.mark.slow
-def test_pictures_survive_a_stop_in_between(finished, meshes, tmp_path, monkeypatch):
-    import qs3.generation.command
-
-    draw = qs3.generation.command._draw
-    monkeypatch.setattr(
-        qs3.generation.command, "_draw", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
-    )
-    with pytest.raises(KeyboardInterrupt):
-        generate(config(tmp_path, meshes, "workers=0"))
-    monkeypatch.setattr(qs3.generation.command, "_draw", draw)
-    generate(config(tmp_path, meshes, "workers=0"))
-    assert fingerprint(tmp_path / "specklenet10") == fingerprint(finished[0])
 
 
 def test_force_takes_old_pictures_and_views_away(meshes, tmp_path):

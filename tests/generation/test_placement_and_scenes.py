@@ -81,14 +81,6 @@ def test_a_room_leaves_the_object_its_place(seed, placing):
             assert (corners.mean(axis=0) @ EYES[:, :2].mean(axis=0)) < -radius
 
 
-def test_pieces_are_watertight():
-    placed = RealSize().place(box(), np.random.default_rng(0))
-    for seed in range(20):
-        for body in Room(wall=0.0).bodies(placed, EYES, np.random.default_rng(seed))[2:]:
-            solid = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces)
-            assert solid.is_watertight
-
-
 @pytest.mark.parametrize(("per_metre", "warned"), [(1000, 1), (1, 0)])
 def test_sizes_that_will_be_lost_are_warned_of(per_metre, warned, tmp_path, caplog):
     (tmp_path / "chair").mkdir()

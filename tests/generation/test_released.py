@@ -5,16 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.config.hydra import build
 from qs3.generation.released import GrowingJitterViews, box_of_corners, euler_xyz
 from qs3.geometry.cameras import look_at, project, rotation_xyz
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.optics.infrared import FilmicCamera
 from qs3.sensors.renderers.base import Body
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.generation.generating import composed as config
 
 BOX = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
 
@@ -22,24 +19,6 @@ BOX = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
 @pytest.fixture(scope="module")
 def renderer():
     return MitsubaRenderer(samples=1)
-
-
-def test_the_switch_changes_all_and_its_absence_nothing():
-    plain, released = (build(config(*more).recipe) for more in ([], ["released=yes"]))
-    assert isinstance(released.views, GrowingJitterViews)
-    assert released.views.count == plain.views.count == 5
-    assert released.crop.margin_m == 0
-    assert released.box_of_corners
-    assert not plain.box_of_corners
-    sensor = released.sensor
-    assert (sensor.matcher.num_disparities, sensor.matcher.block_size) == (160, 19)
-    assert not sensor.matcher.remove_bias
-    assert (sensor.min_depth_m, sensor.max_depth_m) == (1, 6)
-    assert (sensor.sample_offset_px, sensor.centre_error_px) == (0, 0.5)
-    assert sensor.projector_strength == pytest.approx(300 * 6 / (4 * np.pi**2), abs=1e-3)
-    assert isinstance(sensor.infrared, FilmicCamera)
-    assert sensor.infrared.faintest == pytest.approx(0.8 * sensor.ambient)
-    assert config("released=yes").renderer.samples == 128
 
 
 @settings(deadline=None)
