@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache, partial
 from importlib import import_module
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge
@@ -23,22 +23,20 @@ class Catalogue:
     """Objects made on demand, each from (seed, class, split, index) alone.
 
     A larger catalogue therefore begins with the objects of a smaller one, and catalogues with
-    different seeds share no mesh.
+    different seeds share no mesh. Test objects come from structural families that training objects
+    never come from.
 
     Attributes:
         seed: of the whole catalogue.
         train: objects per class in the training split, or a count for every class.
         test: the same for the test split.
         classes: which classes; the order of the items is that of `qs3.classes.CLASSES`.
-        families: "split" makes test objects from structural families that training objects
-            never come from; "all" lets both splits draw from all families.
     """
 
     seed: int = 0
     train: Count | dict[str, Count] = 20
     test: Count | dict[str, Count] = 10
     classes: tuple[str, ...] = CLASSES
-    families: Literal["split", "all"] = "split"
 
     def count(self, cls: str, split: str) -> int:
         """How many objects of a class a split holds."""
@@ -56,7 +54,7 @@ class Catalogue:
         ]
 
     def _item(self, cls: str, split: str, index: int) -> MeshItem:
-        names = [f.name for f in families(cls) if self.families == "all" or f.split == split]
+        names = [f.name for f in families(cls) if f.split == split]
         family = _shuffled(names, f"{self.seed}/{cls}/{split}")[index % len(names)]
         return MeshItem(
             id=f"{cls}/{split}/{cls}_{index:04d}",

@@ -52,7 +52,7 @@ class Family:
 
     Attributes:
         name: unique within its class.
-        split: the only split that draws from it, unless a catalogue has `families="all"`.
+        split: the only split that draws from it.
         build: makes the parts of one object, front along -y.
     """
 
