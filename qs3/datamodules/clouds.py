@@ -121,15 +121,6 @@ class Clouds:
         """All clouds in memory, each in its sample number 0, as evaluation sees them; a copy."""
         return self.take(torch.arange(len(self)))
 
-    def all(self) -> Float[Tensor, "n m 3"]:
-        """The same."""
-        return self.points
-
-    @property
-    def clouds(self) -> Clouds:
-        """These."""
-        return self
-
 
 @dataclass(frozen=True, eq=False)
 class Labelled:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import minimize_scalar
 
 WEIGHT = 1.7245
 """w."""
@@ -92,6 +91,8 @@ def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray,
     rest = 1 / (len(labels) + 2)
     weights = np.full(probabilities.shape, rest / max(1, classes - 1))
     weights[np.arange(len(labels)), labels] = 1 - rest
+
+    from scipy.optimize import minimize_scalar  # slow to import, and a command prints `in_words`
 
     def loss(log_t: float) -> float:
         logs = np.log(np.maximum(scaled(probabilities, math.exp(log_t)), _TINY))

@@ -174,7 +174,7 @@ class Predictor:
         order = sample(whole, self.points, 1) if self.points < len(stored) else None
         one = Clouds.of(whole, order, self.result.scale, floor)
         usual = relax_min_points(self.result.usual, self.points)
-        return Prepared(one.all()[0], tuple(ood_reasons(measure_one(one, 0), usual)))
+        return Prepared(one.points[0], tuple(ood_reasons(measure_one(one, 0), usual)))
 
     def floor(self, given: float | None) -> float:
         """Where the floor is in clouds: as given, else as in the target.

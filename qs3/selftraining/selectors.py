@@ -2,16 +2,17 @@
 
 A selector sees one row a target sample: its id and the probabilities that the teacher gives it. It
 never sees a label. The result does not depend on the order of the rows, nor on what names say
-(`ranked`). Here: QBST and SPST; CBST and CRST in `cbst`, baselines in `baselines`.
+(`ranked`). Here: QBST, SPST and the random control; CBST and CRST in `cbst`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from annotated_types import Ge
 from jaxtyping import Bool, Float, Int
 
 from qs3.errors import ConfigError, SelectionError
@@ -161,6 +162,44 @@ class Spst:
         selected = teacher.confidence > theta
         kept = np.bincount(teacher.predicted[selected], minlength=teacher.classes)
         return Selection(selected, theta, mu=np.ones(len(kept)), confident=kept, kept=kept)
+
+
+@settings
+class Random:
+    """As many samples of each class as another selector keeps, drawn at random.
+
+    A sample's chance is a number made from (seed, round, id): the same whatever the order and
+    whatever else is in the table.
+
+    Attributes:
+        of: the other selector; its pseudo-labels are kept, its choice is not.
+        seed: of the run.
+        pool: drawn from the "confident" samples, above theta, or from "all" of the class.
+    """
+
+    of: Any
+    seed: Annotated[int, Ge(0)] = 0
+    pool: Literal["confident", "all"] = "confident"
+
+    @property
+    def needs_features(self) -> bool:
+        """Whether the other selector looks at features."""
+        return bool(getattr(self.of, "needs_features", False))
+
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
+        """As `Selector.select`; figures are those of the other selector."""
+        given: Selection = self.of.select(teacher, theta, round_)
+        if given.labels is not None:
+            teacher = teacher.relabelled(given.labels)
+        every = np.ones(len(teacher.ids), dtype=bool)
+        allowed = teacher.confidence > theta if self.pool == "confident" else every
+        key = [derive(self.seed, "random selection", round_, id_) for id_ in teacher.ids]
+        drawn = np.argsort(np.array(key), kind="stable")
+        selected = np.zeros(len(teacher.ids), dtype=bool)
+        for k in range(teacher.classes):
+            of_class = drawn[allowed[drawn] & (teacher.predicted[drawn] == k)]
+            selected[of_class[: given.kept[k]]] = True
+        return replace(given, selected=selected)
 
 
 def doubts(

@@ -41,7 +41,7 @@ from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.listed_jobs import ListedJobs, OverLauncher
 from qs3.sweeps.ray_launcher import RayLauncher
-from qs3.training.reuse import check_finished
+from qs3.training.provenance import check_finished
 from qs3.utils.locks import alone
 from qs3.utils.text_table import aligned
 

@@ -7,13 +7,13 @@ from typing import Any
 
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.plugins.environments import LightningEnvironment
-from omegaconf import OmegaConf
+from lightning.pytorch.strategies import DDPStrategy
+from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.engine.checkpointing import AtomicCheckpointIO, Clock, SaveLast
 from qs3.engine.classifier import Classifier
 from qs3.engine.loggers import CsvHistory, EpochRows
-from qs3.engine.trainer import build_each, let_weights_rest, make_trainer
 from qs3.kernels.norms import DomainNorm, check_has_norms
 from qs3.methods.base import Method, feature_dims
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
@@ -24,6 +24,8 @@ from qs3.training.provenance import changed
 from qs3.training.run import Run
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
 from qs3.utils.processor_time import Moment
+
+_OURS = ("threads", "gpus", "cuda_graphs", "float32_matmul")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,17 +64,17 @@ def build_training(
         *(warmup, rounds, student, EpochRows(phases), clock),
         *(SaveLast(folder), shared),
     ]
-    trainer = make_trainer(
+    trainer = _make_trainer(
         cfg,
         max_epochs=phases.total,
-        callbacks=[*build_each(cfg.get("callbacks")), *callbacks],
-        logger=[CsvHistory(folder), *build_each(cfg.get("logger"))],
+        callbacks=[*_build_each(cfg.get("callbacks")), *callbacks],
+        logger=[CsvHistory(folder), *_build_each(cfg.get("logger"))],
         # In a job of SLURM Lightning would take its tasks, mostly one, for the processes.
         plugins=[AtomicCheckpointIO(), LightningEnvironment()],
         default_root_dir=folder,
     )
     if any(isinstance(module, DomainNorm) for module in classifier.net.modules()):
-        let_weights_rest(trainer)  # an epoch may see one of the domains alone
+        _let_weights_rest(trainer)  # an epoch may see one of the domains alone
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     for logger in trainer.loggers:
         logger.log_hyperparams(settings)
@@ -102,3 +104,35 @@ def _classifier(run: Run, method: Method, given: Given | None) -> Classifier:
     if cfg.compile:
         classifier.net.compile()  # in place; nets that are only evaluated stay as they are
     return classifier
+
+
+def _make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
+    """Lightning's trainer by config group `trainer`; `more`: arguments that follow from the run."""
+    settings: Any = OmegaConf.to_container(cfg.trainer, resolve=True)
+    given = {key: value for key, value in settings.items() if key not in _OURS}
+    if isinstance(given.get("profiler"), dict):
+        given["profiler"] = build(cfg.trainer.profiler)
+    return Trainer(
+        **given,
+        **more,
+        reload_dataloaders_every_n_epochs=1,  # each epoch has its own order; rounds, their set
+        use_distributed_sampler=False,  # `Batches` shares the clouds out itself
+        num_sanity_val_steps=0,
+        log_every_n_steps=1,
+        enable_progress_bar=False,  # `qs3.engine.loggers` shows all epochs in one bar
+        enable_model_summary=False,
+    )
+
+
+def _let_weights_rest(trainer: Trainer) -> None:
+    """Of several processes (DDP): a step need not use all weights; the others have no gradient.
+
+    As in one process. Without it DDP waits for all, and 0 in place of none would be decayed.
+    """
+    if isinstance(trainer.strategy, DDPStrategy):
+        trainer.strategy._ddp_kwargs["find_unused_parameters"] = True
+
+
+def _build_each(group: DictConfig | None) -> list[Any]:
+    """The objects of a config group that has several, such as `callbacks`."""
+    return [build(node) for node in (group or {}).values() if node is not None]

@@ -18,7 +18,7 @@ from qs3.evaluation.validators import chosen_in_words
 from qs3.runs.folder import read_code
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
-from qs3.training.reuse import changed_files, refuse_changed
+from qs3.training.provenance import changed_files, refuse_changed
 from qs3.training.run import Run, run_of
 from qs3.utils.locks import owned
 

@@ -26,9 +26,8 @@ from qs3.runs.metrics import Quality, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
 from qs3.selftraining.student_selection import StudentSelection
-from qs3.training import class_shares
 from qs3.training.build import Built
-from qs3.training.load import Loaded
+from qs3.training.load import Loaded, Shares, prior_beside, shares_of_student
 from qs3.training.run import STUDENT, Run
 from qs3.utils.seeding import derive
 
@@ -74,7 +73,7 @@ class Outcome:
     validators: dict[str, float | None]
     quality: Quality
     held_out: HeldOut | None
-    learnt: class_shares.Shares
+    learnt: Shares
     training: TrainingAccuracy | None
 
 
@@ -138,7 +137,7 @@ class SavedNets:
         if key not in self._predicted:
             self._predicted[key] = predict(
                 self._net(file, norms),
-                clouds.all(),
+                clouds.points,
                 self.run.cfg.data.eval_batch_size,
                 self.device,
                 domain="source" if of_source else "target",
@@ -176,7 +175,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
 
     learnt = loaded.learnt
     if run.scheme.rounds:
-        learnt = class_shares.of_student(run.scheme, loaded.labelled, built.rounds.records[-1])
+        learnt = shares_of_student(run.scheme, loaded.labelled, built.rounds.records[-1])
 
     @cache
     def prior_of(weights: Path) -> Prior | None:
@@ -184,7 +183,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         warmups = {files["selected"]: loaded.learnt, files["last"]: loaded.labelled}
         met = warmups.get(weights, learnt)
         said = partial(nets.of_target, weights)
-        return class_shares.prior_of(run.cfg.evaluation, evaluation.classes, met, said)
+        return prior_beside(run.cfg.evaluation, evaluation.classes, met, said)
 
     def reported(weights: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
         found, prior = nets.of_test(weights, turn), prior_of(weights)
@@ -229,7 +228,7 @@ def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
     return Quality(
         validation_accuracy=float((nets.of_validation(file).argmax(axis=1) == labels).mean()),
         expected=expected_accuracy(known, nets.of_test(before, norms=TRAINED)),
-        unlike_source=ood_share(loaded.evaluation.test.clouds, data.all_labelled),
+        unlike_source=ood_share(loaded.evaluation.test, data.all_labelled),
         never_predicted=[name for name, n in zip(classes, counts, strict=True) if not n],
     )
 
@@ -265,7 +264,7 @@ def training_accuracy(
     `owner`: of their labels, "source" or "target_train": whose norms the net takes for them.
     """
     domain = "source" if owner == "source" else "target"
-    table = predict(net, labelled.clouds.all(), batch_size, device, domain=domain)
+    table = predict(net, labelled.clouds.points, batch_size, device, domain=domain)
     right = float((table.argmax(axis=1) == labelled.labels.numpy()).mean())
     log.info("%.1f %% of the %d training clouds are right", 100 * right, len(table))
     return TrainingAccuracy(n=len(table), accuracy=right)

@@ -9,14 +9,14 @@ import logging
 import os
 import signal
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from qs3.config.hydra import build
-from qs3.engine.trainer import quieten, settle_process
 from qs3.errors import ConfigError
 from qs3.methods.base import Method
 from qs3.models.features import remember
@@ -30,6 +30,7 @@ from qs3.training.provenance import warn_of_changes
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
+from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.processor_time import Moment, processor_seconds
 from qs3.utils.threads import cores, number_of
 
@@ -44,7 +45,7 @@ def fit(run: Run) -> RunMetrics:
         interrupted or not, except its times.
     """
     began = Moment(time.time(), processor_seconds())
-    quieten()
+    _quieten()
     trainer = run.cfg.trainer
     settle_process(number_of(trainer.threads), trainer.get("float32_matmul", "highest"))
     method: Method = build(run.cfg.method)
@@ -69,8 +70,7 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     weights alone, so it is the same after any interruption.
 
     Raises:
-        ConfigError: Lightning cannot do as `trainer` says with these data, or a callback has ended
-            the training.
+        ConfigError: a callback has ended the training.
     """
     data, kept = loaded.data, run.cfg.data.cache_dir
     clouds = (data.all_labelled, data.target, loaded.evaluation.test)
@@ -86,8 +86,6 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
             ckpt_path=last if last.is_file() else None,
             weights_only=True,
         )
-    except MisconfigurationException as error:  # e.g. too small a part of an epoch's batches
-        raise ConfigError(f"trainer: {error}") from error
     except SIGTERMException as error:  # of a worker of a sweep; by itself it would be status 0
         raise SystemExit(128 + signal.SIGTERM) from error
     if (done := built.trainer.current_epoch) < run.phases.total:  # `trainer.should_stop`
@@ -95,3 +93,28 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     if built.trainer.is_global_zero:
         save(copy_weights(built.classifier.net), run.folder / STUDENT)
     built.trainer.strategy.barrier("student saved")
+
+
+def settle_process(threads: int, float32_matmul: str = "highest") -> None:
+    """What a training sets for its whole process: memory is kept, no tensor is filled in vain.
+
+    Args:
+        threads: of torch.
+        float32_matmul: see `torch.set_float32_matmul_precision`.
+    """
+    keep_freed_memory()
+    # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision(float32_matmul)
+
+
+def _quieten() -> None:
+    """Leave Lightning's warnings and errors to Hydra's log; drop its tips and adverts."""
+    # Lightning 2.6.6 asks torch 2.13 in an old way; not ours to fix.
+    warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.setLevel(logging.WARNING)
+        logger.propagate = True

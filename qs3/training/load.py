@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from omegaconf import OmegaConf
 
 from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.clouds import Clouds, labels_of, load_clouds
+from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.datamodules.splits import subsample_splits
 from qs3.datasets.domain import Domain
 from qs3.errors import DataError
 from qs3.evaluation.metrics import Evaluation
+from qs3.evaluation.prior import ESTIMATED, Prior, estimate_shares, read_prior, shares_of
 from qs3.methods.base import Method
-from qs3.runs.metrics import DataMadeOf
+from qs3.runs.metrics import DataMadeOf, RoundRecord
 from qs3.store.manifest import read_manifest
 from qs3.store.store import PointSet
-from qs3.training import class_shares
 from qs3.training.given import Given
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
@@ -29,6 +33,10 @@ log = logging.getLogger(__name__)
 _TIMES = 10.0  # larger: centimetres, millimetres, inches, or strays metres away from the object
 _BELOW_M = 0.3  # under all of the other domain; floors are known to a decimetre or two
 _LOOKED_AT = 1000  # clouds, for the floor: those are read from disk
+
+
+Shares = Float[np.ndarray, " c"]
+"""[C], of the classes in what a net learnt from: u in `qs3.evaluation.prior`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +60,8 @@ class Loaded:
     stored_points: int
     started: dict[str, Any]
     made_of: DataMadeOf
-    labelled: class_shares.Shares
-    learnt: class_shares.Shares
+    labelled: Shares
+    learnt: Shares
 
 
 def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
@@ -89,11 +97,11 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
     _warn_of_untrained(data, target)
-    learnt = drawn = class_shares.of_labelled(data, len(target.classes))
+    learnt = drawn = shares_of_labelled(data, len(target.classes))
     if given and cfg.selection.teacher == "given" and given.learnt is not None:
         learnt = given.learnt
     # What is not a prior ends a run before it trains.
-    class_shares.prior_of(cfg.evaluation, target.classes, learnt, lambda: learnt[None])
+    prior_beside(cfg.evaluation, target.classes, learnt, lambda: learnt[None])
     if (few := cfg.data.clouds_a_split) is not None:
         target = subsample_splits(target, few)
     split = "test" if "test" in target.counts() else "train"  # somebody's own scans have no other
@@ -113,6 +121,42 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     check_real_sizes(run.target.name, data.all_labelled, data.target, *tested)
     made_of = DataMadeOf(source=labelled, target=of_target)
     return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt)
+
+
+def shares_of_labelled(data: AdaptationData, classes: int) -> Shares:
+    """Of the labelled clouds, as `data.sampler` draws them."""
+    if data.labelled_domain.sampler == "balanced":
+        return shares_of([], classes)
+    return shares_of(data.labelled.labels.numpy(), classes)
+
+
+def shares_of_student(scheme: SelfTrainingConfig, labelled: Shares, last: RoundRecord) -> Shares:
+    """Of the last round's pseudo-labels; with as many of the source beside them, of both."""
+    counts = list(last.selected.values())
+    pseudo = shares_of(np.repeat(np.arange(len(counts)), counts), len(counts))
+    return (pseudo + labelled) / 2 if scheme.use_source else pseudo
+
+
+def prior_beside(
+    settings: Any,
+    classes: Sequence[str],
+    learnt: Shares,
+    said: Callable[[], Float[np.ndarray, "n c"]],
+) -> Prior | None:
+    """`evaluation.prior` beside these shares; None if there is none.
+
+    `said`: the net's probabilities of the target's training clouds, for shares that are estimated.
+
+    Raises:
+        ConfigError: it is no prior.
+    """
+    if settings.prior is None:
+        return None
+    given: Any = settings.prior
+    if given == ESTIMATED:
+        given = dict(zip(classes, estimate_shares(said(), learnt).tolist(), strict=True))
+    given = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
+    return read_prior(given, classes, learnt, settings.prior_power)
 
 
 def _warn_of_untrained(data: AdaptationData, target: PointSet) -> None:

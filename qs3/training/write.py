@@ -153,7 +153,7 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         target=run.target.name,
         gravity=run.target.gravity,
         scale=run.cfg.data.scale,
-        usual=limits(loaded.data.all_labelled, loaded.data.target.clouds),
+        usual=limits(loaded.data.all_labelled, loaded.data.target),
         weights=copy_weights(outcome.net),
         floor_m=_floor(run),
         held_out=outcome.held_out,
@@ -171,7 +171,7 @@ def _write_of_files(run: Run, loaded: Loaded, outcome: Outcome) -> None:
     rows = read_manifest(run.target.folder, loaded.evaluation.classes)
     origins = {row.id: row.origin for row in rows if row.origin}
     test = loaded.evaluation.test
-    strange = ood_reasons_of_all(test.clouds, source_limits(loaded.data.all_labelled))
+    strange = ood_reasons_of_all(test, source_limits(loaded.data.all_labelled))
     write_predictions_of_files(
         run.folder / OF_FILES,
         [origins.get(id_, id_) for id_ in test.ids],

@@ -12,7 +12,7 @@ if ENABLED:
 
 import torch
 
-from qs3.engine.trainer import settle_process
+from qs3.training.fit import settle_process
 
 
 @pytest.fixture(autouse=True, scope="session")

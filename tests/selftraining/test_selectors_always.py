@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
 from qs3.datamodules.phases import SelfTrainingConfig
-from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
-from qs3.selftraining.selectors import Qbst, Spst
+from qs3.selftraining.selectors import Qbst, Random, Spst
 from qs3.utils.seeding import derive
 from tests.composing import compose
 from tests.selftraining.test_selectors_balanced import select

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst, class_thresholds
-from qs3.selftraining.selectors import Qbst, Spst, TeacherPredictions
+from qs3.selftraining.selectors import Qbst, Random, Spst, TeacherPredictions
 
 
 def select(selector, probabilities, theta=0.0, ids=None, round_=0):

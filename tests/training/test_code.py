@@ -10,9 +10,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from qs3.config import hashing
-from qs3.training import reuse as code
+from qs3.training import provenance as code
 from qs3.training.command import train
-from qs3.training.reuse import changed_files, files_sha256
+from qs3.training.provenance import changed_files, files_sha256
 
 NET = "from tests.training.toy import TinyNet\n\n\nclass Net(TinyNet):\n    pass\n"
 ROOT = Path(code.__file__).parents[1]

@@ -38,7 +38,7 @@ class Watch(Callback):
         self, trainer: Any, pl_module: Any, batch: dict[str, Any], batch_idx: int
     ) -> None:
         data = trainer.datamodule
-        for domain, clouds in (("source", data.labelled.clouds), ("target", data.target.clouds)):
+        for domain, clouds in (("source", data.labelled.clouds), ("target", data.target)):
             if domain in batch:
                 same = (batch[domain]["points"][:, None] == clouds.points[None]).all(dim=(2, 3))
                 assert (same.sum(1) == 1).all()
