@@ -6,8 +6,6 @@ import os
 import pytest
 from hypothesis import settings
 
-from tests.slow import is_slow
-
 _SLOW_S = 2400
 
 # One thread a process: tests start many short ones, and two OpenMP teams on two cores spend
@@ -30,10 +28,8 @@ if os.environ.get("QS3_CHECK_SHAPES"):  # `make test-all`
 
 @pytest.hookimpl(tryfirst=True)  # before pytest leaves out what is marked
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what `tests/slow.py` lists; slow tests get the time that a busy machine takes."""
+    """Give slow tests the time that a busy machine takes."""
     for item in items:
-        if is_slow(item.nodeid):
-            item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(_SLOW_S))
 

@@ -33,6 +33,7 @@ def test_toy_is_the_same_each_time_and_as_it_says(tmp_path):
     assert ToyNet(4)(torch.rand(5, 64, 3)).shape == (5, 4)
 
 
+@pytest.mark.slow
 def test_train_leaves_what_the_command_leaves(tmp_path):
     write_toy(tmp_path)
     folder = train(*toy_overrides(tmp_path), *SHORT, "seed=3")

@@ -76,6 +76,7 @@ def test_every_notebook_is_tested():
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == sorted(NAMES)
 
 
+@pytest.mark.slow
 def test_01_sensor():
     done = run("01_sensor", FOLDER)
     assert len(images(done)) == 10
@@ -90,6 +91,7 @@ def test_01_sensor():
     assert printed(done, "stderr") == ""
 
 
+@pytest.mark.slow
 def test_02_qbst():
     done = run("02_qbst", ROOT)  # from the root as well as from notebooks/
     assert len(images(done)) == 2
@@ -106,6 +108,7 @@ def test_02_qbst():
     assert mu == pytest.approx([1 - n / sum(counts) for n in counts], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_03_results():
     done = run("03_results", FOLDER)
     assert len(images(done)) == 4
@@ -122,6 +125,7 @@ def test_03_results():
     assert "160 test clouds" in text
 
 
+@pytest.mark.slow
 def test_03_results_of_own_runs(tmp_path):
     done = run("03_results", FOLDER, LOG_DIR=str(tmp_path / "logs"), TABLE="quickstart")
     text = printed(done)
@@ -129,6 +133,7 @@ def test_03_results_of_own_runs(tmp_path):
     assert "no finished run is in this table" in text
 
 
+@pytest.mark.slow
 def test_04_pyg():
     done = run("04_pyg", FOLDER)
     text = printed(done)

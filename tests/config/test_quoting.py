@@ -52,6 +52,7 @@ def test_an_interpolation_stays_one_where_it_was_typed():
     assert quoted("${paths.data_dir}/x") == "${paths.data_dir}/x"
 
 
+@pytest.mark.slow
 def test_every_path_of_ours_reaches_the_config(tmp_path):
     """The toy's words, and those of a table's cells."""
     folder = tmp_path / "1, b (c) [d] it's ${x}"

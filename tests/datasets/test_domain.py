@@ -104,6 +104,7 @@ def _open(data_dir):
     return Domain("d", "D", "D", data_dir / "d", published=published).open().sha256
 
 
+@pytest.mark.slow
 def test_processes_that_open_at_once_import_once(tmp_path):
     fixtures.write_domain("depthscannet10", tmp_path, SPLITS)
     with multiprocessing.get_context("spawn").Pool(3) as pool:

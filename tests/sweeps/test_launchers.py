@@ -22,6 +22,7 @@ LAUNCHERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_gpus_in_turn_and_a_failure(launcher, tmp_path):
     """Three jobs on two GPUs, the first fails: the others run, and the failure is the last word."""
@@ -68,6 +69,7 @@ def test_a_job_of_rays_whose_process_is_killed_begins_again(tmp_path):
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.slow
 def test_listed_jobs_in_parts(tmp_path):
     """Any jobs, numbered through; each part has to end before the next begins."""
     jobs = [["selftraining.theta=0.5"], ["seed=9"], ["method=dann", "seed=4"]]

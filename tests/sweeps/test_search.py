@@ -43,6 +43,7 @@ def search(folder, trials: int, *more: str):
     return light(folder, SEARCH, f"hydra.sweeper.trials={trials}", "hydra.sweeper.random=4", *more)
 
 
+@pytest.mark.slow
 def test_it_finds_goes_on_and_is_repeatable(tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     for folder in (whole, parts):
@@ -144,6 +145,7 @@ def test_objectives_are_label_free():
             check_objective(refused)
 
 
+@pytest.mark.slow
 def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
     """With rounds and without; by `selection.student` the last epoch's score is the same one."""
     metrics = train(toy("selection.student=infomax", "selftraining.epochs=1"))
@@ -239,6 +241,7 @@ def test_configs_are_within_what_self_training_takes(name):
     assert text[1] == f"# python train.py -m experiment=qs3_s2d hparams_search={name}"
 
 
+@pytest.mark.slow
 def test_the_grid_is_every_combination(tmp_path):
     """Every combination of what the command line leaves open; it ends with each objective."""
     fixed = [
@@ -271,6 +274,7 @@ def test_the_grid_is_every_combination(tmp_path):
     assert "  diverged: qs3_s2d/seed7-" in result.stdout
 
 
+@pytest.mark.slow
 def test_a_run_that_diverged_is_a_bad_trial_and_no_failure(tmp_path):
     """It is listed, is not tried again, and the search goes on."""
     result = search(tmp_path, 3, "seed=7")

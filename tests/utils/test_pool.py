@@ -83,6 +83,7 @@ def die_at_once():
     os._exit(3)
 
 
+@pytest.mark.slow
 def test_a_worker_that_cannot_start_is_the_death_of_each_task():
     assert all(o.died for o in Processes(2).run(die_at_once, squares(3)))
 
@@ -110,6 +111,7 @@ def test_an_error_says_where_it_was_raised():
         run([("bad", ("unpicklable", None))])
 
 
+@pytest.mark.slow
 def test_processes_are_replaced_after_a_number_of_tasks():
     tasks = [(str(i), ("pid", None)) for i in range(5)]
     pids = [o.result for o in Processes(1, tasks_per_process=2).run(make, tasks)]
