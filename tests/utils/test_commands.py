@@ -142,6 +142,7 @@ def test_signals_end_a_hydra_command(tmp_path):
     for name, status in (("SIGINT", 130), ("SIGTERM", 143)):
         code = (
             "import os, signal, sys\nfrom qs3.utils.commands import hydra_command\n"
+            "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
             "@hydra_command\ndef main():\n"
             f" try:\n  os.kill(os.getpid(), signal.{name})\n"
             " finally:\n  print('put away', flush=True)\nmain()"
