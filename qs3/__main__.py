@@ -3,7 +3,6 @@
 import logging
 import sys
 
-from qs3.commands.report import REPORT
 from qs3.utils.commands import Commands, run
 
 ABOUT = """from CAD meshes to a classifier that works on real depth scans
@@ -21,7 +20,18 @@ COMMANDS: Commands = {
     "scannet": "qs3.commands.scannet:scannet",
     "predict": "qs3.commands.predict:predict",
     "export": "qs3.commands.predict:export",
-    "report": REPORT,
+    "report": {
+        "": "qs3.commands.report:table",
+        "table": "qs3.commands.report:table",
+        "train": "qs3.commands.report:train",
+        "keep": "qs3.commands.report:keep",
+        "compare": "qs3.commands.report:compare",
+        "effects": "qs3.commands.report:effects",
+        "judge": "qs3.commands.report:judge",
+        "page": "qs3.commands.report:page",
+        "pictures": "qs3.commands.report:pictures",
+        "pipeline": "qs3.commands.report:pipeline",
+    },
     "leaderboard": "qs3.commands.report:leaderboard",
     "bench": "qs3.commands.bench:bench",
     "fit": "qs3.commands.fit:fit",

@@ -16,18 +16,6 @@ if TYPE_CHECKING:
     from qs3.report.tables.comparison import Compared
     from qs3.report.tables.table import Table
 
-REPORT = {
-    "": "qs3.commands.report:table",
-    "table": "qs3.commands.report:table",
-    "train": "qs3.commands.report:train",
-    "keep": "qs3.commands.report:keep",
-    "compare": "qs3.commands.report:compare",
-    "effects": "qs3.commands.report:effects",
-    "judge": "qs3.commands.report:judge",
-    "page": "qs3.commands.report:page",
-    "pictures": "qs3.commands.report:pictures",
-    "pipeline": "qs3.commands.report:pipeline",
-}
 
 _Logs = Annotated[str, "paths.log_dir of the runs"]
 _Data = Annotated[str | None, "paths.data_dir of the runs"]
