@@ -34,9 +34,9 @@ from qs3.generation.kept import Keep
 from qs3.generation.released import read_poses
 from qs3.generation.room_scans import RoomScan
 from qs3.meshes.folder import SPLITS, MeshFolder
-from qs3.meshes.gltf import buffer_files
 from qs3.meshes.io import Up
 from qs3.meshes.mesh import MeshItem
+from qs3.meshes.scenes import buffer_files
 from qs3.store.parts import VIEWS as VIEWS_FOLDER
 from qs3.utils.files import sha256_file
 from qs3.utils.settings import problems, settings

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,9 +33,10 @@ from qs3.utils.settings import settings
 
 SPLITS = ("train", "test")
 SPLIT_FOLDERS = {
-    **{"train": "train", "test": "test"},
+    **{"": "", "train": "train", "test": "test"},
     **dict.fromkeys(("val", "valid", "validation"), "train"),
 }
+"""Split by the folder's name; "" of files right in the folder of their class."""
 LAYOUTS = "expected class/train/name.off with class/test/name.off, or class/name.off"
 
 
@@ -86,11 +87,9 @@ class MeshFolder:
     def left_alone(self) -> list[str]:
         """Names of the folders with meshes of classes that are not wanted, or not known; sorted."""
         return [
-            entry.name
-            for entry in _visible(self.path)
-            if entry.is_dir()
-            and known_as(entry.name, self.known) not in self._wanted
-            and _mesh_below(entry)
+            folder.name
+            for folder in _folders(self.path)
+            if known_as(folder.name, self.known) not in self._wanted and any(_meshes_below(folder))
         ]
 
     @property
@@ -99,13 +98,11 @@ class MeshFolder:
 
     def _class_folders(self) -> dict[str, list[Path]]:
         """The folders of each wanted class that is there; each has one at least."""
-        if not self.path.is_dir():
-            raise MissingDataError(f"there is no folder of meshes at {self.path}")
         folders: dict[str, list[Path]] = {}
-        for entry in _visible(self.path):
-            cls = known_as(entry.name, self.known)
-            if entry.is_dir() and cls in self._wanted:
-                folders.setdefault(cls, []).append(entry)
+        for folder in _folders(self.path):
+            cls = known_as(folder.name, self.known)
+            if cls in self._wanted:
+                folders.setdefault(cls, []).append(folder)
         missing = [name for name in self._wanted if name not in folders]
         if not folders or not set(missing) <= set(self.optional):
             raise MissingDataError(
@@ -116,41 +113,24 @@ class MeshFolder:
 
     def _groups(self, cls: str, folders: Sequence[Path]) -> dict[str, dict[str, Path]]:
         """Split -> stem -> file of one class."""
-        given: dict[str, list[Path]] = {split: [] for split in SPLITS}
-        loose: list[Path] = []
-        for folder in folders:
-            loose += self._mesh_files(folder, allowed=tuple(SPLIT_FOLDERS))
-            for entry in _visible(folder):
-                if entry.is_dir() and entry.name.lower() in SPLIT_FOLDERS:
-                    given[SPLIT_FOLDERS[entry.name.lower()]] += self._mesh_files(entry)
-        if loose and any(given.values()):
+        found: dict[str, dict[str, Path]] = {}
+        files = [(below, file) for below in folders for file in _meshes_below(below)]
+        for below, file in files:
+            above = "/".join(file.relative_to(below).parts[:-1]).lower()
+            if above not in SPLIT_FOLDERS:
+                raise ConfigError(
+                    f"{file} lies in a folder that is neither a class nor a split: {LAYOUTS}"
+                )
+            other = found.setdefault(SPLIT_FOLDERS[above], {}).setdefault(file.stem, file)
+            if other != file:
+                raise ConfigError(f"{other} and {file} are two files for one object")
+        loose = found.pop("", {})
+        if loose and found:
             raise ConfigError(
-                f"class {cls!r} in {self.path} mixes two layouts, such as {loose[0]}: move all "
-                "files into train and test, or none"
+                f"class {cls!r} in {self.path} mixes two layouts: move all files into train and "
+                "test, or none"
             )
-        if loose:
-            return self._split(cls, self._by_stem(loose))
-        return {split: self._by_stem(given[split]) for split in SPLITS}
-
-    def _mesh_files(self, folder: Path, allowed: tuple[str, ...] = ()) -> list[Path]:
-        """Mesh files right in `folder`; meshes in sub-folders that are not `allowed` raise."""
-        files = []
-        for entry in _visible(folder):
-            if entry.is_dir():
-                if entry.name.lower() not in allowed and (mesh := _mesh_below(entry)):
-                    raise ConfigError(
-                        f"{mesh} lies in a folder that is neither a class nor a split: {LAYOUTS}"
-                    )
-            elif entry.suffix.lower() in SUFFIXES:
-                files.append(entry)
-        return files
-
-    def _by_stem(self, files: Sequence[Path]) -> dict[str, Path]:
-        stems: dict[str, Path] = {}
-        for file in files:
-            if stems.setdefault(file.stem, file) != file:
-                raise ConfigError(f"{stems[file.stem]} and {file} are two files for one object")
-        return stems
+        return self._split(cls, loose) if loose else {"train": {}, "test": {}, **found}
 
     def _split(self, cls: str, files: dict[str, Path]) -> dict[str, dict[str, Path]]:
         """The first `test_fraction` in the order of a hash; both splits get one if they can."""
@@ -175,20 +155,18 @@ class MeshFolder:
         return MeshItem(f"{cls}/{split}/{stem}", cls, split, load, origin, file)
 
 
-def _visible(folder: Path) -> list[Path]:
-    return [
-        entry
-        for entry in sorted(folder.iterdir())
-        if not entry.name.startswith(".") and entry.name != "__MACOSX"
-    ]
+def _folders(root: Path) -> list[Path]:
+    """Visible folders right below `root`, sorted; none if it is not there."""
+    return sorted(path for path in root.glob("[!.]*") if path.is_dir())
 
 
-def _mesh_below(folder: Path) -> Path | None:
-    for parent, _, names in os.walk(folder):
-        for name in names:
-            if not name.startswith(".") and Path(name).suffix.lower() in SUFFIXES:
-                return Path(parent, name)
-    return None
+def _meshes_below(folder: Path) -> Iterator[Path]:
+    """Mesh files in `folder` and below it, of what is not hidden."""
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
+        for name in sorted(names):
+            if Path(name).suffix.lower() in SUFFIXES and not name.startswith("."):
+                yield Path(parent, name)
 
 
 def _hash(purpose: str, cls: str, stem: str) -> str:

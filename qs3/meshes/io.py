@@ -1,14 +1,11 @@
 """Read one CAD file as a `Mesh`.
 
-Axes and units are the file's own, with one exception: glTF, COLLADA and 3MF state which axis is up,
-so their meshes are turned to z up (and COLLADA's and 3MF's are scaled to metres). Of the other
-formats the caller states it.
+Axes and units are the file's own, with one exception: glTF and 3MF state which axis is up, so their
+meshes are turned to z up (and 3MF's are scaled to metres).
 """
 
 from __future__ import annotations
 
-import errno
-import logging
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -17,36 +14,26 @@ from typing import Literal
 import numpy as np
 
 from qs3.errors import MeshError, MeshUnavailableError
-from qs3.meshes.gltf import read_gltf
-from qs3.meshes.mesh import Y_UP_TO_Z_UP, Colliders, Mesh, without_strays
-from qs3.meshes.off_obj_stl import read_obj, read_off, read_stl
-from qs3.meshes.ply import read_ply
+from qs3.meshes.mesh import Y_UP_TO_Z_UP, Mesh, without_strays
 from qs3.meshes.polygons import Triangles
-from qs3.meshes.xml_scenes import read_3mf, read_collada
+from qs3.meshes.scenes import read_3mf, read_gltf
+from qs3.meshes.surfaces import read_obj, read_off, read_ply, read_stl
 
-log = logging.getLogger(__name__)
-
-_READERS: dict[str, Callable[[bytes, Path, Colliders], Triangles]] = {
-    ".off": lambda data, *_: read_off(data),
-    ".obj": lambda data, *_: read_obj(data),
-    ".ply": lambda data, *_: read_ply(data),
-    ".stl": lambda data, *_: read_stl(data),
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".dae": lambda data, _, colliders: read_collada(data, colliders),
-    ".3mf": lambda data, _, colliders: read_3mf(data, colliders),
+_SURFACES: dict[str, Callable[[bytes], Triangles]] = {
+    **{".off": read_off, ".obj": read_obj, ".ply": read_ply, ".stl": read_stl},
 }
-SUFFIXES: tuple[str, ...] = tuple(_READERS)
+_SCENES: dict[str, Callable[[bytes, Path, bool], Mesh]] = {
+    **{".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf},
+}
+SUFFIXES: tuple[str, ...] = (*_SURFACES, *_SCENES)
 """Suffixes of the files that `load_mesh` reads, in lower case."""
 
-DECLARE_UP = (".glb", ".gltf", ".dae", ".3mf")
+DECLARE_UP: tuple[str, ...] = tuple(_SCENES)
 """Those of files that state which axis is up, or whose standard does."""
 
 Up = Literal["z", "y"]
 
-# Errors of the system that a file can cause by itself: a decoder's, and a name in it that none has.
-_BY_THE_FILE = (None, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.ENOTDIR)
-_PLY_HEADER = 1 << 16  # bytes that its header is looked for in
+_PLY_HEADER = 1 << 16  # bytes in which its header is searched
 
 
 def is_mesh(path: Path) -> bool:
@@ -69,47 +56,29 @@ def load_mesh(path: str | Path, keep_colliders: bool = False, up: Up = "z") -> M
 
     Args:
         path: of a file with one of `SUFFIXES`, in any case.
-        keep_colliders: keep a scene's nodes that stand for collisions and that nobody sees (see
-            `qs3.meshes.mesh.Colliders`); else they are left out, and counted in the mesh.
+        keep_colliders: keep a scene's invisible nodes (`qs3.meshes.mesh.is_collider`); else they
+            are left out, and counted in the mesh.
         up: which axis is up in a file that does not state it (not of `DECLARE_UP`); "y" is turned
             to z up, (x, y, z) -> (x, -z, y).
 
     Raises:
-        MeshError: the file is empty, truncated or damaged, or holds no surface; names the file.
+        MeshError: the file is empty, truncated or damaged; names the file.
         MeshUnavailableError: it is not there, or its disk does not give it.
     """
-    path, colliders = Path(path), Colliders(skip=not keep_colliders)
+    path = Path(path)
     suffix = path.suffix.lower()
-    if not path.is_file():
-        raise MeshUnavailableError(f"{path}: is not a file")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MeshUnavailableError(f"{path}: cannot be read now ({error.strerror})") from error
     try:
         with np.errstate(all="ignore"):  # what is not finite is found by `Mesh`
-            vertices, faces = _READERS[suffix](path.read_bytes(), path.parent, colliders)
-            if up == "y" and suffix not in DECLARE_UP:
+            if suffix in _SCENES:
+                return _SCENES[suffix](data, path.parent, keep_colliders)
+            vertices, faces = _SURFACES[suffix](data)
+            if up == "y":
                 vertices = vertices @ Y_UP_TO_Z_UP.T
-            mesh = Mesh(*without_strays(vertices, faces), colliders.count)
-            if not _has_area(mesh):
-                raise MeshError("has no surface: all its faces have zero area")
-    except OSError as error:
-        if error.errno in _BY_THE_FILE:
-            raise _damaged(path, error) from error
-        raise MeshUnavailableError(f"{path}: cannot be read now ({error.strerror})") from error
+            return Mesh(*without_strays(vertices, faces))
     except Exception as error:  # what a reader raises on damaged bytes cannot be listed
-        raise _damaged(path, error) from error
-    for note in colliders.notes:
-        log.warning("%s: %s", path, note)
-    return mesh
-
-
-def _damaged(path: Path, error: Exception) -> MeshError:
-    kind = "" if isinstance(error, MeshError) else f"{type(error).__name__}: "
-    return MeshError(f"{path}: cannot be read ({kind}{error})")
-
-
-def _has_area(mesh: Mesh) -> bool:
-    """Whether any face is more than a line, measured by the mesh's own size."""
-    low, high = mesh.bounds
-    size = float((high - low).max())
-    corners = (mesh.vertices[mesh.faces] - low) / (size or 1.0)
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return bool((np.linalg.norm(doubled, axis=1) > 1e-12).any())
+        kind = "" if isinstance(error, MeshError) else f"{type(error).__name__}: "
+        raise MeshError(f"{path}: cannot be read ({kind}{error})") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,24 +55,17 @@ class Mesh:
     ) -> Mesh:
         """The triangles of a mesh of trimesh, or of a scene put together, as they stand.
 
-        Vertices that no triangle uses are left out. z is up here and lengths are metres; nothing is
-        turned or scaled.
-
-        Args:
-            solid: a mesh, whatever its name, or a scene.
-            keep_colliders: as `qs3.meshes.io.load_mesh`.
+        Vertices that no triangle uses are left out; nothing is turned or scaled. `keep_colliders`
+        as in `qs3.meshes.io.load_mesh`.
         """
         import trimesh
 
         if isinstance(solid, trimesh.Scene):
-            colliders = Colliders(skip=not keep_colliders)
-            hidden = colliders.left_out_of(solid)
+            hidden, count = (set(), 0) if keep_colliders else _collider_nodes(solid)
             solids = [part for part in solid.dump() if isinstance(part, trimesh.Trimesh)]
             seen = [part for part in solids if part.metadata["node"] not in hidden]
-            parts = [cls.from_trimesh(part) for part in seen if len(part.faces)]
-            if not parts:
-                raise MeshError("has no faces, or those of colliders alone")
-            return replace(merge(parts), colliders=colliders.count)
+            whole = merge([cls.from_trimesh(part) for part in seen if len(part.faces)])
+            return replace(whole, colliders=count)
         return cls(*without_strays(np.array(solid.vertices), np.array(solid.faces)))
 
     def to_trimesh(self) -> trimesh.Trimesh:
@@ -106,31 +99,27 @@ class Mesh:
 
 def merge(meshes: list[Mesh]) -> Mesh:
     """One mesh from several, parts kept apart (no vertex is shared between them)."""
+    if not meshes:
+        raise MeshError("has no faces, or those of colliders alone")
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     vertices = np.concatenate([m.vertices for m in meshes])
     faces = np.concatenate([m.faces + o for m, o in zip(meshes, offsets, strict=True)])
     return Mesh(vertices, faces)
 
 
-def used_part(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Only the vertices that `faces` [F, 3] use, in their order: parts often share one list."""
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise MeshError(f"has a face with a vertex that is not among {len(vertices)}")
-    used, flat = np.unique(faces, return_inverse=True)
-    return vertices[used].astype(np.float64), flat.reshape(-1, 3)
-
-
 def without_strays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same without vertices that no face uses; the same arrays where there are none.
 
-    Modelling programs leave some behind. Nobody sees them, but furniture is as large, and shadow
-    rays begin as far away, as all vertices say. Where one is not finite the file is damaged, which
-    `Mesh` finds: then none is left out.
+    Modelling programs leave some behind. They are not seen, but furniture is as large, and shadow
+    rays begin as far away, as all vertices tell. Of a damaged file, where one is not finite, none
+    is left out: `Mesh` raises.
     """
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
-    whole = used.all() or not np.isfinite(vertices).all()
-    return (vertices, faces) if whole else used_part(vertices, faces)
+    if used.all() or not np.isfinite(vertices).all():
+        return vertices, faces
+    places, flat = np.unique(faces, return_inverse=True)
+    return vertices[places], flat.reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -162,9 +151,8 @@ _COLLIDER = re.compile(
 )
 
 
-@dataclass
-class Colliders:
-    """Nodes of a scene that stand for collisions and that nobody sees: left out, and counted.
+def is_collider(*names: str | None) -> bool:
+    """Whether a node of a scene with one of these names stands for collisions, and is not seen.
 
     A game engine's invisible hulls come along in its exports. Scanned as if they were furniture,
     they fill the legs of a chair. Known by the name of the node or of its mesh, in any case:
@@ -172,37 +160,26 @@ class Colliders:
     - `chair_collider`, `chair_collision`, also with a number behind: what exporters write;
     - UCX_, UBX_, UCP_, USP_ and MCDCX_ before the name: Unreal Engine's static mesh pipeline;
     - `-colonly` and `-convcolonly` behind it: Godot (its `-col` keeps the mesh visible).
-
-    Attributes:
-        skip: False leaves none out.
-        count: nodes left out so far.
-        notes: what else a reader left out, for `load_mesh` to log.
     """
+    return any(_COLLIDER.search(str(name)) for name in names if name)
 
-    skip: bool = True
-    count: int = 0
-    notes: list[str] = field(default_factory=list)
 
-    def left_out(self, *names: str | None) -> bool:
-        """Whether a node with one of these names is left out; if so, it is counted."""
-        found = self.skip and any(_COLLIDER.search(str(name)) for name in names if name)
-        self.count += found
-        return found
+def _collider_nodes(scene: trimesh.Scene) -> tuple[set[Hashable], int]:
+    """Nodes whose geometry is left out, colliders and all below them; and how many colliders.
 
-    def left_out_of(self, scene: trimesh.Scene) -> set[Hashable]:
-        """Nodes of trimesh's scene whose geometry is left out: colliders, and all below them.
-
-        As in files: a node below another one that is left out is not counted again, and a mesh
-        with such a name hides the node's own geometry only.
-        """
-        forest, hidden = scene.graph.transforms, set()
-        waiting = [node for node in forest.nodes if node not in forest.parents]
-        while waiting:
-            node = waiting.pop()
-            if self.left_out(str(node)):
-                hidden |= forest.successors(node)
-                continue
-            if self.left_out(forest.node_data[node].get("geometry")):
-                hidden.add(node)
-            waiting += forest.children.get(node, ())
-        return hidden
+    A node below a collider is not counted again; a mesh with such a name hides the node's own
+    geometry only.
+    """
+    forest, hidden, count = scene.graph.transforms, set(), 0
+    waiting = [node for node in forest.nodes if node not in forest.parents]
+    while waiting:
+        node = waiting.pop()
+        if is_collider(str(node)):
+            hidden |= forest.successors(node)
+            count += 1
+            continue
+        if is_collider(forest.node_data[node].get("geometry")):
+            hidden.add(node)
+            count += 1
+        waiting += forest.children.get(node, ())
+    return hidden, count

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -48,16 +48,6 @@ def whole(values: np.ndarray) -> np.ndarray:
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
         raise MeshError("a vertex index is not a whole number")
     return values.astype(np.int64)
-
-
-def joined(parts: Iterable[Triangles]) -> Triangles:
-    """One mesh of all parts."""
-    vertices, faces, total = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
-    for own, corners in parts:
-        vertices.append(own)
-        faces.append(corners + total)
-        total += len(own)
-    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def fan(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import collections
 import pickle
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -13,7 +12,6 @@ from qs3.errors import ConfigError, MissingDataError
 from qs3.meshes.folder import MeshFolder
 
 OFF = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
-CAD10 = Path(__file__).parents[3] / "shared" / "data" / "cad10"
 
 
 def make(root, *names):
@@ -153,19 +151,3 @@ def test_halves_share_nothing_and_miss_nothing(tmp_path, n):
     assert sorted(first + second) == sorted(ids(tmp_path))
     counts = collections.Counter(name.split("/")[1] for name in second)
     assert counts == {"train": n // 2, "test": n // 2}
-
-
-def test_real_meshes():
-    if not CAD10.is_dir():
-        pytest.skip(f"no {CAD10}: the CAD meshes are not part of the project")
-    items = MeshFolder(CAD10).items()
-    counts = collections.Counter(item.cls for item in items)
-    assert counts == {
-        **{"bathtub": 8, "bed": 35, "bookshelf": 47, "cabinet": 47, "chair": 86},
-        **{"lamp": 24, "monitor": 11, "plant": 35, "sofa": 32, "table": 64},
-    }
-    assert len({item.id for item in items}) == 389
-    for item in items:
-        low, high = item.load().bounds
-        assert abs(low[2]) < 1e-3, item.id  # they rest on the floor
-        assert 0.01 < (high - low).max() < 10, item.id

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from qs3.meshes.io import load_mesh
 from qs3.meshes.polygons import fan, triangulated
-from tests.meshes.written import PRIMITIVES, dae, save
+from tests.meshes.written import save
 
 U = [(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
 KEYHOLE = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)]
@@ -117,17 +117,7 @@ def test_what_crosses_itself_or_has_no_area_is_a_fan(outline):
     assert cut(outline).tolist() == fan(np.array([count]), np.arange(count)).tolist()
 
 
-def concave_dae(lines):
-    """A polylist of one polygon, with another column beside the corners."""
-    text = dae(primitive=PRIMITIVES["polylist"], up="Y_UP").replace('meter="0.5"', 'meter="1"')
-    start, end = text.index("9 0 0 0 1"), text.index("</float_array>")
-    text = text[:start] + f"9 {' '.join(lines)}" + text[end:]
-    text = text.replace('count="18"', 'count="25"').replace('count="4"', 'count="8"')
-    text = text.replace("<vcount>4<", "<vcount>8<")
-    return text.replace("7 0 7 1 7 2 7 3", " ".join(f"7 {i}" for i in range(8)))
-
-
-@pytest.mark.parametrize("suffix", ["obj", "ply", "off", "dae"])
+@pytest.mark.parametrize("suffix", ["obj", "ply", "off"])
 def test_a_concave_face_of_a_file(tmp_path, suffix):
     for start in range(8):
         points = U[start:] + U[:start]
@@ -139,7 +129,6 @@ def test_a_concave_face_of_a_file(tmp_path, suffix):
             "ply": "ply\nformat ascii 1.0\nelement face 1\nproperty list int int vertex_indices\n"
             "element vertex 8\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
             f"8 {each}\n" + "\n".join(lines) + "\n",
-            "dae": concave_dae(lines),
         }[suffix]
         mesh = load_mesh(save(tmp_path, f"a.{suffix}", text))
         one, two = (

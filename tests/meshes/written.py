@@ -95,7 +95,7 @@ def gltf(**changes):
         "scenes": [{"nodes": [0, 2]}],
         "nodes": [
             {"children": [1], "translation": [10, 0, 0], "scale": [2, 2, 2]},
-            {"mesh": 0, "camera": 0, "rotation": [0, 0, 2**-0.5, 2**-0.5]},
+            {"mesh": 0, "rotation": [0, 0, 2**-0.5, 2**-0.5]},
             {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 7, 1]},
         ],
         "meshes": [{"primitives": [triangles, *strips, {**points_alone, "mode": 0}]}],
@@ -112,41 +112,6 @@ def gltf(**changes):
         "buffers": [{"byteLength": 76, "uri": uri}],
     }
     return {**tree, **changes}, blob
-
-
-GEOMETRY = """
-<library_geometries>
-  <geometry id="g"><mesh>
-    <source id="p"><float_array id="pa" count="18">9 0 0 0 1 0 0 1 1 0 0 1 0 5 5 5 6 6</float_array>
-      <technique_common><accessor source="#pa" count="4" stride="3" offset="1"/></technique_common>
-    </source>
-    <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-    {primitive}
-  </mesh></geometry>
-</library_geometries>"""
-TRIANGLES = """<triangles count="2"><input semantic="VERTEX" source="#v" offset="0"/>
-  <input semantic="NORMAL" source="#v" offset="1"/><p>0 9 1 9 2 9 0 9 2 9 3 9</p></triangles>"""
-PRIMITIVES = {
-    "triangles": TRIANGLES,
-    "polylist": """<polylist count="1"><input semantic="NORMAL" source="#v" offset="0"/>
-      <input semantic="VERTEX" source="#v" offset="1"/><vcount>4</vcount>
-      <p>7 0 7 1 7 2 7 3</p></polylist>""",
-    "polygons": """<polygons count="2"><input semantic="VERTEX" source="#v" offset="0"/>
-      <p>0 1 2</p><p>0 2 3</p></polygons><lines><input semantic="VERTEX" source="#v"/></lines>""",
-}
-
-
-def dae(
-    primitive=TRIANGLES, nodes='<node><instance_geometry url="#g"/></node>', head="", up="Z_UP"
-):
-    return f"""<?xml version="1.0" encoding="utf-8"?>{head}
-<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit meter="0.5" name="half"/><up_axis>{up}</up_axis></asset>
-{GEOMETRY.format(primitive=primitive)}
-<library_nodes><node id="n"><instance_geometry url="#g"/></node>
-  <node id="loop"><instance_node url="#loop"/></node></library_nodes>
-<library_visual_scenes><visual_scene id="s">{nodes}</visual_scene></library_visual_scenes>
-<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
