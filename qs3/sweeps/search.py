@@ -32,7 +32,7 @@ from hydra.core.override_parser.types import (
 )
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from qs3.config import hashing
 from qs3.config.location import typed
@@ -129,6 +129,7 @@ class LabelFreeSearch(OverLauncher):
         loader = self.hydra_context.config_loader
         for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             one = loader.load_sweep_config(self.config, [*fixed, *overrides(words(trial.params))])
+            one = OmegaConf.masked_copy(one, [key for key in one if key != "hydra"])
             if check_finished(one, "or begin another search with another experiment_name"):
                 return
 

@@ -16,7 +16,7 @@ from tests.generation.generating import composed as config
 DOMAINS = (
     *("specklenet10", "specklenet10_clean", "blensor10", "kinectsim10"),
     *("modelnet10", "modelnet10_dropout"),
-    *("specklenet10_view", "specklenet10_kinect", "roomscan10", "kinectsim10_full"),
+    *("specklenet10_view", "roomscan10", "kinectsim10_full"),
 )
 
 

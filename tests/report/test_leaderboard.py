@@ -63,7 +63,7 @@ TOY = shlex.join(
     [
         *("num_classes=3", "model._target_=tests.training.nets.tiny", "data.points=32"),
         *("protocol.epochs=1", "protocol.steps=null", "protocol.optimizer.lr=0.02"),
-        *("callbacks=none", "report.pictures=false"),
+        *("callbacks.progress=null", "report.pictures=false"),
     ]
 )
 SMALL = """
@@ -80,10 +80,9 @@ rows:
 
 
 def test_every_method_is_there():
-    """Of PCFEA's pools by a selector of `selftraining` one stands for both."""
     there = {word for words in LINES.values() for word in words if word.startswith("method=")}
     files = {f"method={name}" for name in choices("method")}
-    assert there == files - {"method=source_only", "method=own", "method=pcfea_spst"}
+    assert there == files - {"method=source_only", "method=own"}
 
 
 def test_columns_for_development_see_no_object_of_the_judge():

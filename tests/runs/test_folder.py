@@ -156,7 +156,12 @@ def test_which_commands_are_the_same_run():
         whole, dann, searched, ddp, *gpus = (
             hashing.run_name(compose("train", ["experiment=qs3_s2d", *words]))
             for words in (
-                *([], ["method=dann"], ["hparams_search=qbst_optuna"], ["trainer=ddp"]),
+                *(
+                    [],
+                    ["method=dann"],
+                    ["hparams_search=qbst_optuna"],
+                    ["trainer=gpu", "trainer.devices=2"],
+                ),
                 *(["trainer=gpu"], ["trainer=gpus_in_turn"]),
                 ["trainer=gpu", "trainer.devices=[3]"],
             )

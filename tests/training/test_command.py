@@ -101,7 +101,9 @@ def _failed(tmp_path, *words):
 
 @pytest.mark.slow
 def test_ddp_is_refused_in_a_multirun(tmp_path):
-    result = command(tmp_path, "experiment=qs3_s2d", "trainer=ddp", "seed=0,1", "-m")
+    result = command(
+        tmp_path, "experiment=qs3_s2d", "trainer=gpu", "trainer.strategy=ddp", "seed=0,1", "-m"
+    )
     assert result.returncode == 1
     assert "hydra/launcher=joblib" in result.stderr
 

@@ -21,6 +21,8 @@ from tests.training.conftest import result_of
 from tests.training.toy import overrides
 from tests.training.watching import interrupt
 
+UNTURNED = ("protocol.augment.rotate_z=false", "protocol.augment.jitter_sigma=0")
+
 
 @pytest.fixture
 def frozen(toy_data, tmp_path):
@@ -31,7 +33,7 @@ def frozen(toy_data, tmp_path):
     words = [word for word in overrides(tmp_path) if "model." not in word]
 
     def config(*more, file=tmp_path / "net.onnx"):
-        own = ("model=features", f"model.file={file}", "model.hidden=[8]", "protocol=frozen")
+        own = ("model=features", f"model.file={file}", "model.hidden=[8]", *UNTURNED)
         paths = (f"paths.data_dir={toy_data}", f"paths.cache_dir={tmp_path / 'cache'}")
         return compose("train", [*words, *own, *paths, "protocol.epochs=4", *more])
 

@@ -49,7 +49,6 @@ METHODS = {
     "mlsp": ("method=mlsp", FEATURED),
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
     "pcfea_qbst": ("method=pcfea_qbst", FEATURED),
-    "pcfea_spst": ("method=pcfea_spst", "method.theta=0.3", FEATURED),
     "supervised": ("method=supervised",),
     "own": ("method=own", f"method.file={OWN}"),
 }

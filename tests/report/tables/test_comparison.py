@@ -110,7 +110,7 @@ def test_other_targets_are_not_compared(tmp_path):
 def test_runs_are_not_compared_with_themselves(tmp_path):
     """Overrides may make two rows one."""
     lines = ("title: t", "metrics: [accuracy]", f"columns: [{PLACE}]", "rows:")
-    rows = (f"  - {{name: {name}, run: experiment=pcm_s2d}}" for name in "ab")
+    rows = (f"  - {{name: {name}, run: experiment=qs3_s2d selftraining=none}}" for name in "ab")
     (tmp_path / "own.yaml").write_text("\n".join([*lines, *rows]))
     table = fill(tmp_path, str(tmp_path / "own.yaml"), {"a": 10})
     (one,) = against(table, "a")

@@ -195,8 +195,8 @@ def test_problems_reach_the_reader(tmp_path):
 
 def test_another_target(own):
     rows = (
-        ("pcm", "paper: [72.4], run: experiment=pcm_s2d"),
-        ("upper", "run: experiment=supervised_d"),
+        ("pcm", "paper: [72.4], run: experiment=qs3_s2d selftraining=none"),
+        ("upper", "run: experiment=source_only_s2d method=supervised"),
     )
     lines = [f"- {{name: {name}, {rest}}}" for name, rest in rows]
     text = "\n".join(["title: x", "metrics: [accuracy]", "columns: [S → D]", "rows:", *lines])
