@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -18,12 +18,8 @@ from qs3.store.meta import MadeOf
 if TYPE_CHECKING:
     from qs3.generation.workers import Outcome
 
-_MATERIALS = {
-    "mixed": "mixed materials",
-    "clear": "mixed and clear materials",
-    "principled": "principled materials",
-}
-_LIGHTS = {"area": "light above", "bounced": "light between surfaces"}
+_MATERIALS = {"mixed": "mixed materials", "principled": "principled materials"}
+_LIGHTS = {"area": "light above"}
 
 
 def made_of(plan: Plan, outcomes: Sequence[Outcome], recipe: Mapping[str, Any]) -> MadeOf:
@@ -77,9 +73,7 @@ def _sensor(cfg: DictConfig) -> str:
     if kinds := cfg.get("materials"):
         words.append(_named("materials", kinds, _MATERIALS))
     if light := cfg.get("light"):
-        bounces = bool(light.get("bounces"))
-        words.append(_named("light", light, _LIGHTS, ("bounces",)))
-        words += ["light between surfaces"] * (bounces and "height_m" in light)
+        words.append(_named("light", light, _LIGHTS))
     if errors := cfg.get("depth_errors"):
         words += ["no holes"] * (not errors.holes) + ["no mixed pixels"] * (not errors.mixed_pixels)
     return ", ".join(words)
@@ -98,25 +92,16 @@ def _own_preset() -> str:
     return _with(name, changed)
 
 
-def _named(
-    group: str,
-    settings: DictConfig,
-    words: Mapping[str, str] | None = None,
-    besides: Collection[str] = (),
-) -> str:
-    """The file of a group that settings are most like, and what they have else.
+def _named(group: str, settings: DictConfig, words: Mapping[str, str] | None = None) -> str:
+    """The file of a folder of conf that settings are most like, and what they have else.
 
-    Args:
-        group: its folder in conf.
-        settings: to be named.
-        words: for each file, what it is called; None: its name.
-        besides: keys that are said elsewhere.
+    `words` has what each file is called; None: its name.
     """
     plain = _plain(settings)
     found: list[tuple[int, str, list[str]]] = []
     for name, file in _files(group).items():
         if file.get("_target_") == plain["_target_"]:
-            changed = [word for key, word in _differences(plain, file) if key not in besides]
+            changed = list(_differences(plain, file))
             found.append((len(changed), name, changed))
     if not found:  # of one's own
         return str(plain["_target_"].rsplit(".", 1)[-1])
@@ -132,17 +117,17 @@ def _with(name: str, changed: Sequence[str]) -> str:
 
 def _differences(
     given: Mapping[str, Any], file: Mapping[str, Any], above: str = ""
-) -> Iterator[tuple[str, str]]:
-    """Each key that has another value than in a file, with dots, and "key=value" or "no key"."""
+) -> Iterator[str]:
+    """Each key, with dots, that has another value than in a file: "key=value" or "no key"."""
     for key in (*given, *(key for key in file if key not in given)):
         value, place = given.get(key), above + key
         other = file.get(key)
         if isinstance(value, dict) and isinstance(other, dict):
             yield from _differences(value, other, f"{place}.")
         elif key not in given:
-            yield place, f"no {place}"
+            yield f"no {place}"
         elif key not in file or value != other:
-            yield place, f"{place}={json.dumps(value)}".replace('"', "")
+            yield f"{place}={json.dumps(value)}".replace('"', "")
 
 
 def _plain(settings: DictConfig) -> dict[str, Any]:

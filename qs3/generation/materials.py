@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Interval
@@ -24,9 +24,7 @@ _SAME = 1e-5  # of the largest side: vertices nearer to each other are one
 _ALIKE = 1e-3  # of the largest side: parts whose sides differ by less are alike
 
 NotNegative = Annotated[float, Ge(0)]
-Bounces = Annotated[int, Interval(ge=0, le=1)]
 Rough = Annotated[float, Interval(ge=0.1, le=1)]
-Clear = Annotated[float, Interval(ge=0, le=0.95)]
 
 
 @settings
@@ -36,7 +34,7 @@ class Kind:
     Attributes:
         weight: how often it is drawn, relative to the others.
         albedo: in the near infrared, where most dyes are clear and carbon black is not.
-        roughness, specular, metal, transmission: see `Gloss`.
+        roughness, specular, metal: see `Gloss`.
     """
 
     weight: NotNegative
@@ -44,16 +42,13 @@ class Kind:
     roughness: tuple[Rough, Rough]
     specular: tuple[Share, Share] = (0.5, 0.5)
     metal: bool = False
-    transmission: tuple[Clear, Clear] | None = None
 
     def draw(self, rng: np.random.Generator) -> Surface:
         """Albedo and gloss of one surface."""
         albedo, roughness, specular = (
             float(rng.uniform(*ends)) for ends in (self.albedo, self.roughness, self.specular)
         )
-        # Drawn only where it is asked for: kinds without it are drawn as they were.
-        clear = 0.0 if self.transmission is None else float(rng.uniform(*self.transmission))
-        return albedo, Gloss(roughness, specular, self.metal, clear)
+        return albedo, Gloss(roughness, specular, self.metal)
 
 
 @settings
@@ -133,31 +128,6 @@ def _faces_of(mesh: Mesh, wanted: np.ndarray) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
 
 
-@runtime_checkable
-class Light(Protocol):
-    """What a recipe's `light` is."""
-
-    def over(self, box_m: np.ndarray) -> Lighting:
-        """The light about an object with box [2, 3]."""
-
-
-@settings
-class SensorLight:
-    """The sensor's own light alone, and what surfaces in it give each other.
-
-    Attributes:
-        bounces: 1: surfaces light each other, once; see `Scene.bounces`. 0: they do not.
-        ambient: of light from all sides, in place of `sensor.ambient`; null: that.
-    """
-
-    bounces: Bounces = 1
-    ambient: NotNegative | None = None
-
-    def over(self, box_m: np.ndarray) -> Lighting:
-        """The same wherever the object is."""
-        return Lighting(None, self.ambient, self.bounces)
-
-
 @settings
 class LightAbove:
     """The paper's light (section 3.1): one area light on top of the object, a level square.
@@ -168,14 +138,12 @@ class LightAbove:
         strength: radiance of a white level surface there, in the units of `sensor.ambient`: with
             sensor=speckle_stereo a lit dot on white has 1 at 4 m.
         ambient: of light from all sides, in place of `sensor.ambient`; null: that.
-        bounces: 1: surfaces in the projector's light light each other, once.
     """
 
     height_m: Positive = 1.5
     side_m: Positive = 24.34
     strength: NotNegative = 0.15
     ambient: NotNegative | None = None
-    bounces: Bounces = 0
 
     def over(self, box_m: np.ndarray) -> Lighting:
         """Over an object with box [2, 3]."""
@@ -187,4 +155,4 @@ class LightAbove:
         part = slope / math.hypot(1, slope)
         seen = 4 / math.pi * part * math.atan(part)
         area = AreaLight(pose, self.side_m, self.strength / seen)
-        return Lighting(area, self.ambient, self.bounces)
+        return Lighting(area, self.ambient)

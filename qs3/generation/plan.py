@@ -310,13 +310,11 @@ def _unused(cfg: DictConfig, recipe: Any) -> list[str]:
     """Keys that are given and that change nothing: figures would name them all the same."""
     if not recipe.needs_renderer:
         return [key for key in _OF_LOOKING if cfg.get(key)]
-    light = cfg.get("light")
     no_use = {
         "poses": "poses" not in cfg.recipe,
         "tracking": isinstance(recipe, RoomScan) and build(cfg.tracking) != Drift(),
         "materials": not recipe.sensor.sees_light,
-        "light": not recipe.sensor.sees_light
-        or bool(light and light.bounces and not recipe.sensor.sees_bounces),
+        "light": not recipe.sensor.sees_light,
     }
     return [key for key, without in no_use.items() if without and cfg.get(key)]
 

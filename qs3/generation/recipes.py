@@ -21,7 +21,7 @@ from pydantic import InstanceOf
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
 from qs3.generation.kept import Keep, preview_of, provenance_of, save_view
-from qs3.generation.materials import Light, MixedMaterials
+from qs3.generation.materials import LightAbove, MixedMaterials
 from qs3.generation.released import PoseTable, ReleasedPlacing, ReleasedViews, box_of_corners
 from qs3.generation.scenes import Alone, Surroundings
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
@@ -226,7 +226,7 @@ class Mesh2Point:
     min_clean_points: Least | None = None
     poses: InstanceOf[PoseTable] | None = None
     materials: InstanceOf[MixedMaterials] | None = None
-    light: Light | None = None
+    light: LightAbove | None = None
     depth_errors: InstanceOf[DepthErrors] | None = None
     box_of_corners: bool = False
     needs_renderer: bool = True

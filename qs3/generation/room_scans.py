@@ -22,7 +22,7 @@ from qs3.datasets.regions import Rules, pieces
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
 from qs3.generation.kept import Keep, preview_of, provenance_of, save_view
-from qs3.generation.materials import Light, MixedMaterials
+from qs3.generation.materials import LightAbove, MixedMaterials
 from qs3.generation.recipes import Cloud, Count, MaskCrop, TooFewPointsError
 from qs3.generation.scenes import HAIR_M, Room, around_an_eye
 from qs3.geometry.cameras import Intrinsics, look_at
@@ -139,7 +139,7 @@ class RoomScan:
     clean: bool = True
     views: Literal[1] = 1
     materials: InstanceOf[MixedMaterials] | None = None
-    light: Light | None = None
+    light: LightAbove | None = None
     needs_renderer: bool = True
 
     def make(

@@ -93,12 +93,10 @@ class Lighting:
         area: a light with shadows.
         ambient: radiance of light from all sides, in place of the sensor's `ambient`; None: that.
             Both are in the units of the sensor's.
-        bounces: see `Scene.bounces`.
     """
 
     area: AreaLight | None = None
     ambient: float | None = None
-    bounces: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +132,7 @@ class Shot:
         if self.lighting.ambient is not None:
             ambient = self.lighting.ambient
         place = self.lighting
-        return Scene(self.bodies, projector, ambient, place.area, place.bounces)
+        return Scene(self.bodies, projector, ambient, place.area)
 
     def image(self, projector: Projector | None = None, ambient: float = 0.0) -> Image:
         """What the camera sees, with the geometry; draws a seed."""
@@ -216,11 +214,9 @@ class DepthSensor(ABC):
         width_px, height_px, focal_px: of its camera, or of both.
         sees_light: whether what it measures depends on materials and light; one that adds noise
             to the true depth says False.
-        sees_bounces: whether also on light between surfaces.
     """
 
     sees_light: ClassVar[bool] = True
-    sees_bounces: ClassVar[bool] = True
 
     width_px: Count = 640
     height_px: Count = 480

@@ -201,7 +201,6 @@ def test_scans_that_would_share_a_name_are_refused(tmp_path):
         (["domain=kinectsim10", "poses=a.tar.gz"], "no use for poses"),
         (["domain=roomscan10", "tracking=drifting"], "no use for tracking"),
         (["domain=roomscan10", "scene=alone"], "scene"),
-        (["sensor=time_of_flight", "light=bounced"], "no use for light"),
         (["domain=modelnet10_dropout", "recipe.dropout.max_share=0.9"], "dropout"),
         (["materials=mixed", "materials.kinds.wood.albedo=[0.4,1.2]"], "wood.albedo"),
     ],

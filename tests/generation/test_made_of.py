@@ -76,8 +76,7 @@ PAPER = ["domain=specklenet10", "materials=principled", "light=area"]
     ("words", "said"),
     [
         (PAPER, "principled materials, light above"),
-        ([*PAPER, "light.bounces=1"], "principled materials, light above, light between surfaces"),
-        (["light=bounced", "light.ambient=0.3"], "light between surfaces with ambient=0.3"),
+        (["light=area", "light.ambient=0.3"], "light above with ambient=0.3"),
         (
             ["materials=mixed", "materials.kinds.metal.weight=0.5", "~materials.kinds.paint"],
             "mixed materials with kinds.metal.weight=0.5 no kinds.paint",

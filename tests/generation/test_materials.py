@@ -1,7 +1,5 @@
 """What bodies are made of, and in which light they stand."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
@@ -138,17 +136,3 @@ def test_an_object_s_bytes_depend_on_its_id_and_not_on_the_others():
     matt = qs3.generate({"b": stool().to_trimesh()}, *words[:-2])["b"]
     np.testing.assert_array_equal(matt.clean, alone.clean)  # it stands where it stood
     assert (matt.frames[0].images["left"] != alone.frames[0].images["left"]).mean() > 0.05
-
-
-def test_kinds_without_transmission_are_drawn_as_they_were():
-    glass = Kind(0.0, (0, 0), (0.1, 0.1), transmission=(0.5, 0.9))
-    bodies = [Body(block((1, 1, 1)))] * 20
-    kinds = {"a": Kind(1.0, (0.1, 0.9), (0.3, 0.9))}
-    plain, beside = (
-        MixedMaterials(some).dress(bodies, np.random.default_rng(0))
-        for some in (kinds, kinds | {"glass": glass})
-    )
-    assert [(b.albedo, b.gloss) for b in plain] == [(b.albedo, b.gloss) for b in beside]
-    alone = MixedMaterials({"glass": replace(glass, weight=1.0)})
-    dressed = alone.dress(bodies, np.random.default_rng(0))
-    assert all(0.5 <= body.gloss.transmission <= 0.9 for body in dressed)

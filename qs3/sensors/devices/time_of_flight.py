@@ -30,7 +30,7 @@ it went; higher harmonics of the modulation; motion between buckets.
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Interval, MinLen
@@ -71,7 +71,6 @@ class TimeOfFlight(DepthSensor):
         min_depth_m, max_depth_m: depths outside are dropped.
     """
 
-    sees_bounces: ClassVar[bool] = False
     width_px: Count = 320
     height_px: Count = 288
     focal_px: Positive = 252.0

@@ -2,16 +2,14 @@
 
 from qs3.sensors.matching.base import Match, Matcher
 from qs3.sensors.matching.census import CensusMatcher
-from qs3.sensors.matching.correlation import NormalisedCorrelation, ReferenceMatcher
-from qs3.sensors.matching.opencv import STEREOBM_BIAS_PX, SemiGlobalMatcher, StereoBlockMatcher
+from qs3.sensors.matching.correlation import ReferenceMatcher
+from qs3.sensors.matching.opencv import STEREOBM_BIAS_PX, StereoBlockMatcher
 
 __all__ = [
     "STEREOBM_BIAS_PX",
     "CensusMatcher",
     "Match",
     "Matcher",
-    "NormalisedCorrelation",
     "ReferenceMatcher",
-    "SemiGlobalMatcher",
     "StereoBlockMatcher",
 ]

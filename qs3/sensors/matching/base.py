@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 
 from qs3.sensors.optics.infrared import GreyNoise
 from qs3.sensors.optics.visibility import Reason
-from qs3.utils.settings import NotNegative, Positive, settings
+from qs3.utils.settings import Positive, settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,32 +75,6 @@ def found_px(matcher: Matcher) -> tuple[float, float]:
     return first + 0.5, first + matcher.num_disparities - 1.5
 
 
-def side_by_side(
-    image: np.ndarray, other: np.ndarray, first: int, low: int, high: int, margin: int
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Both images on canvases of one size, for matchers that want that (OpenCV's).
-
-    Args:
-        image, other, first: as in `Matcher.match`.
-        low, high: smallest and largest disparity searched.
-        margin: px around, dark.
-
-    Returns:
-        Two [h, width] uint8 arrays, dark where there is nothing, and the column at which
-        `image` starts in the first. In the second, the pixel that `image` column c meets at
-        disparity d is in column start + c - d.
-    """
-    height, width = image.shape
-    start = margin + max(high, 0)
-    total = start + width + margin + max(-low, 0)
-    a = np.zeros((height, total), dtype=np.uint8)
-    a[:, start : start + width] = image
-    if other.dtype != np.uint8:
-        other = np.clip(np.rint(other), 0, 255).astype(np.uint8)
-    # Column x of `other` goes to column x + start - first.
-    return a, columns_of(other, first - start, total), start
-
-
 def columns_of(image: np.ndarray, begin: int, count: int) -> np.ndarray:
     """Columns begin .. begin + count - 1 of an image, 0 where it has none."""
     out = np.zeros((image.shape[0], count), dtype=image.dtype)
@@ -108,30 +82,6 @@ def columns_of(image: np.ndarray, begin: int, count: int) -> np.ndarray:
     if high > low:
         out[:, low - begin : high - begin] = image[:, low:high]
     return out
-
-
-def opencv_disparity(
-    matcher: Any, image: np.ndarray, other: np.ndarray, first: int, margin: int, missing: float
-) -> tuple[np.ndarray, np.ndarray, tuple]:
-    """What OpenCV's StereoBM or StereoSGBM finds.
-
-    Args:
-        matcher: OpenCV's, with its range of disparities set.
-        image, other, first: as in `Matcher.match`.
-        margin: px around, dark.
-        missing: largest disparity that counts as none; at least 0 if the search begins there,
-            where it is a point at infinity.
-
-    Returns:
-        [h, w] float32 disparity in px with NaN; `image` on its dark canvas, and its place there.
-    """
-    low = matcher.getMinDisparity()
-    high = low + matcher.getNumDisparities() - 1
-    left, right, start = side_by_side(image, other, first, low, high, margin)
-    place = np.s_[:, start : start + image.shape[1]]
-    disparity = matcher.compute(left, right)[place].astype(np.float32) / 16
-    disparity[disparity <= (missing if low else max(missing, 0))] = np.nan
-    return disparity, left, place
 
 
 def offset(lower: np.ndarray, best: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -169,43 +119,30 @@ class TextureOverNoise:
     """A window is textured if it varies more than the camera's noise lets a flat one vary.
 
     In contrast to a threshold in grey values it asks no more of a dim or a dull picture than of a
-    bright one. The noise is the camera's shot and read noise at the window's mean grey value, and
-    of what its amplifier does to the picture; sensors say both for each picture (`for_picture`).
+    bright one.
 
     Attributes:
         ratio: standard deviation of the texture over that of the noise. In 9 x 9 pixels of noise
             alone the two are mistaken for each other up to a ratio of about 0.6.
-        electrons_at_white: electrons at grey value 255; null: as the picture's camera has them.
-        read_noise_e: read-out noise, electrons; null: the camera's.
+        noise: of the picture, at each window's mean grey value; sensors set it for each picture
+            (`for_picture`).
     """
 
     ratio: Positive = 0.7
-    electrons_at_white: Positive | None = None
-    read_noise_e: NotNegative | None = None
+    noise: GreyNoise | None = None
 
     def enough(self, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """[h, w] bool from the mean and the variance of the grey values of each window."""
-        assert self.electrons_at_white is not None, "a camera without noise takes texture=null"
-        assert self.read_noise_e is not None
-        noise = GreyNoise(self.electrons_at_white, self.read_noise_e).variance(mean)
-        return variance >= (1 + self.ratio**2) * noise
-
-    def at(self, noise: GreyNoise) -> TextureOverNoise:
-        """With `noise` where nothing was set."""
-        electrons, read = self.electrons_at_white, self.read_noise_e
-        return replace(
-            self,
-            electrons_at_white=noise.electrons_at_white if electrons is None else electrons,
-            read_noise_e=noise.read_noise_e if read is None else read,
-        )
+        assert self.noise is not None, "a camera without noise takes texture=null"
+        return variance >= (1 + self.ratio**2) * self.noise.variance(mean)
 
 
 def for_picture(matcher: Matcher, noise: GreyNoise) -> Matcher:
     """The matcher for pictures with this noise; itself, if it has no `texture` that asks."""
     texture = getattr(matcher, "texture", None)
-    if not isinstance(texture, TextureOverNoise) or texture.at(noise) == texture:
+    if texture is None:
         return matcher
-    return replace(matcher, texture=texture.at(noise))  # type: ignore[type-var]
+    return replace(matcher, texture=replace(texture, noise=noise))  # type: ignore[type-var]
 
 
 def window_moments(image: np.ndarray, window_px: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,11 +1,7 @@
-"""Matching by normalised correlation, of two images or against a stored one.
-
-By compiled loops where numba is, with the same values.
-"""
+"""Matching by normalised correlation; by compiled loops where numba is, with the same values."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -39,26 +35,14 @@ def correlation(
         out[:] = (product - means[0] * means[1]) / (spreads[0] * spreads[1])
 
 
-@dataclass(frozen=True, eq=False)
-class Winner:
-    """The highest of the scores of each pixel.
+def winner(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The highest of the scores [n, h, w] float32 without NaN of each pixel.
 
-    Attributes:
-        place: [h, w] integers, the first that has it.
-        top: [h, w] float32, the score.
-        lower, upper: [h, w] float32, its neighbours'; at an end of the search its own.
-        second: [h, w] float32, the highest more than 2 places away; at least -1.
+    Returns:
+        [h, w] integers, the first place that has it; [4, h, w] float32: the score, its two
+        neighbours' (at an end of the search its own), and the highest more than 2 places away,
+        at least -1.
     """
-
-    place: np.ndarray
-    top: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    second: np.ndarray
-
-
-def winner(scores: np.ndarray) -> Winner:
-    """The highest of scores [n, h, w] float32 without NaN."""
     if not has_numba():
         return _winner_by_numpy(scores)
     from qs3.sensors.matching.numba_kernels import best_and_second
@@ -66,31 +50,28 @@ def winner(scores: np.ndarray) -> Winner:
     place = np.empty(scores.shape[1:], dtype=np.int32)
     beside = np.empty((4, *place.shape), dtype=np.float32)
     best_and_second(scores, place, beside)
-    return Winner(place, *beside)
+    return place, beside
 
 
-def _winner_by_numpy(scores: np.ndarray) -> Winner:
+def _winner_by_numpy(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     last = len(scores) - 1
     place = scores.argmax(axis=0)
-
-    def score_at(index: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(scores, index[None], axis=0)[0]
-
-    top = score_at(place)
-    lower, upper = score_at(np.maximum(place - 1, 0)), score_at(np.minimum(place + 1, last))
+    around = [place, np.maximum(place - 1, 0), np.minimum(place + 1, last)]
+    found = [np.take_along_axis(scores, index[None], axis=0)[0] for index in around]
     # The runner-up: blank the winner's neighbourhood and look again.
     others = scores.copy()
     for near in range(-2, 3):
         np.put_along_axis(others, np.clip(place + near, 0, last)[None], -1, axis=0)
-    return Winner(place, top, lower, upper, others.max(axis=0))
+    return place, np.stack([*found, others.max(axis=0)])
 
 
 @settings
-class NormalisedCorrelation:
-    """Normalised correlation over a square window, winner takes all.
+class ReferenceMatcher:
+    """Normalised correlation over a square window, winner takes all, as in Kinect v1.
 
     A parabola goes through the best score and its two neighbours. Gain and offset of the
-    images do not matter.
+    images do not matter. Of Kinect v1 Konolige and Mihelich (ROS, kinect_calibration/technical)
+    give a 9 x 9 or 9 x 7 window, 64 px of search and 1/8 px.
 
     Attributes:
         window_px: side of the window, odd.
@@ -101,9 +82,9 @@ class NormalisedCorrelation:
     """
 
     window_px: Annotated[int, Ge(3), IsOdd] = 9
-    min_disparity: int = 0
+    min_disparity: int = -24
     num_disparities: Annotated[int, Ge(3)] = 64
-    steps_per_px: Annotated[int, Ge(0)] = 0
+    steps_per_px: Annotated[int, Ge(0)] = 8
     min_score: float = 0.35
     uniqueness: float = 0.04
 
@@ -116,10 +97,9 @@ class NormalisedCorrelation:
         """Disparities; see `Matcher.match`."""
         scores = self._scores(image, other.astype(np.float32, copy=False), first)
         last = len(scores) - 1
-        found = winner(scores)
-        best, top, lower, upper = found.place, found.top, found.lower, found.upper
+        best, (top, lower, upper, second) = winner(scores)
         inner = (best > 0) & (best < last)
-        unique = top - found.second >= self.uniqueness
+        unique = top - second >= self.uniqueness
         valid = inner & (top >= self.min_score) & unique
 
         curvature = np.maximum(2 * top - lower - upper, np.float32(1e-6))
@@ -168,15 +148,3 @@ class NormalisedCorrelation:
             spreads = spread_i[:, here], spread_r[:, there]
             correlation(product, means, spreads, score[:, here])
         return scores
-
-
-@settings
-class ReferenceMatcher(NormalisedCorrelation):
-    """One camera against a stored image of the pattern, as in Kinect v1.
-
-    Konolige and Mihelich (ROS, kinect_calibration/technical) give a 9 x 9 or 9 x 7 window,
-    64 px of search and 1/8 px.
-    """
-
-    min_disparity: int = -24
-    steps_per_px: Annotated[int, Ge(0)] = 8

@@ -82,26 +82,17 @@ class Scene:
             sampling noise and is the same in every renderer. The background of an image, where no
             body is, is 0.
         area: sampled once for each sample of a pixel, so it has a little sampling noise.
-        bounces: 0, direct light only; 1, surfaces in the projector's light also light each other,
-            by what they scatter evenly (their shine is left out).
     """
 
     bodies: tuple[Body, ...]
     projector: Projector | None = None
     ambient: float = 0.0
     area: AreaLight | None = None
-    bounces: int = 0
 
     @property
     def plain(self) -> bool:
-        """Whether all is matt and lit directly, by no area: what every variant can render."""
-        direct = self.area is None and not self.bounces
-        return direct and all(body.gloss is None for body in self.bodies)
-
-    @property
-    def clear(self) -> bool:
-        """Whether light passes through any body."""
-        return any(body.gloss is not None and body.gloss.transmission for body in self.bodies)
+        """Whether all is matt and there is no area light: what every variant can render."""
+        return self.area is None and all(body.gloss is None for body in self.bodies)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,6 @@ from qs3.sensors.renderers.blender_surfaces import (
     add_area,
     add_projector,
     blender_pose,
-    glow_for_camera_only,
     matrix_of,
     show_camera_only,
     surface,
@@ -43,7 +42,6 @@ from qs3.sensors.renderers.blender_surfaces import (
 # How far behind a surface its shadow caster lies, relative to the distance from the projector:
 # 0.2 mm at 2 m, about the gap that Mitsuba leaves.
 _SHADOW_GAP = 1e-4
-_SHEETS = 32  # clear faces on the way from the camera and on to the light; Cycles' own limit is 8
 _BACKGROUND_M = 1e9  # Cycles writes 1e10 m where nothing is hit
 
 
@@ -110,8 +108,6 @@ class BlenderRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         target = bpy.context.scene
         _configure(target, self.settings)
-        if scene.clear:  # a camera's and a light's ray count together
-            target.cycles.transparent_max_bounces = _SHEETS
         blender_devices.use(bpy, target.cycles, self.device)
         try:
             bodies = [_add_body(bpy, target, body, scene) for body in scene.bodies]
@@ -119,8 +115,6 @@ class BlenderRenderer:
             if scene.projector is not None:
                 lamps.append(add_projector(bpy, target, scene.projector))
                 lamps += [_cast_shadow_by_copy(target, thing, scene.projector) for thing in bodies]
-                if scene.bounces:
-                    _light_each_other(target, bodies, lamps[1:])
             eye = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
             target.collection.objects.link(eye)
             target.camera = eye
@@ -160,7 +154,6 @@ class BlenderRenderer:
         layer, images = target.view_layers[0], []
         for index, (camera, wanted) in enumerate(zip(cameras, geometry, strict=True)):
             _aim(target, eye, camera)
-            layer.pass_alpha_threshold = 0.0  # the geometry of a clear surface is its own
             layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_normal = wanted
             # Cameras of one call must not share their sampling noise.
             target.cycles.seed = (seed + 0x9E3779B9 * index) % 2**31
@@ -236,7 +229,7 @@ def _configure(target: Any, settings: RendererSettings) -> None:
     cycles.use_light_tree = False
     cycles.light_sampling_threshold = 0.0  # else weak light is dropped at random
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
-    cycles.max_bounces = 0  # clear surfaces are passed all the same
+    cycles.max_bounces = 0
     cycles.caustics_reflective = cycles.caustics_refractive = False
     cycles.use_auto_tile = False
     cycles.film_exposure = 1.0
@@ -313,17 +306,6 @@ def _cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> Any:
     thing.visible_shadow = False
     target.collection.objects.link(copy)
     return copy
-
-
-def _light_each_other(target: Any, bodies: Sequence[Any], copies: Sequence[Any]) -> None:
-    """Follow light from surface to surface, once, by what they scatter evenly."""
-    target.cycles.max_bounces = target.cycles.diffuse_bounces = 1
-    target.cycles.glossy_bounces = target.cycles.transmission_bounces = 0
-    for thing in bodies:
-        thing.visible_diffuse = True
-        glow_for_camera_only(thing)
-    for copy in copies:
-        copy.visible_diffuse = copy.visible_glossy = False
 
 
 def _aim(target: Any, eye: Any, camera: Camera) -> None:

@@ -15,7 +15,6 @@ from qs3.sensors.renderers.base import AreaLight, Body, Projector
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
 _WATT_PER_RADIANCE = 4 * math.pi**2
 _GLOW = "ambient"
-_CLEAR = "clear"
 
 
 def surface(bpy: Any, body: Body, ambient: float) -> Any:
@@ -26,7 +25,6 @@ def surface(bpy: Any, body: Body, ambient: float) -> Any:
     tree = material.node_tree
     tree.nodes.clear()
     node, link = tree.nodes.new, tree.links.new
-    clear = 0.0 if body.gloss is None else body.gloss.transmission
     if body.gloss is None:
         bsdf, colour = node("ShaderNodeBsdfDiffuse"), "Color"
         bsdf.inputs["Roughness"].default_value = 0.0
@@ -45,54 +43,24 @@ def surface(bpy: Any, body: Body, ambient: float) -> Any:
     total, output = node("ShaderNodeAddShader"), node("ShaderNodeOutputMaterial")
     link(bsdf.outputs[0], total.inputs[0])
     link(glow.outputs[0], total.inputs[1])
-    if clear:
-        nothing, mix = node("ShaderNodeBsdfTransparent"), node("ShaderNodeMixShader")
-        mix.name = _CLEAR
-        mix.inputs[0].default_value = clear
-        link(total.outputs[0], mix.inputs[1])
-        link(nothing.outputs[0], mix.inputs[2])
-        total = mix
     link(total.outputs[0], output.inputs["Surface"])
     return material
-
-
-def glow_for_camera_only(thing: Any) -> None:
-    """Let the glow of ambient light be seen by the camera, and light nothing else."""
-    tree = thing.data.materials[0].node_tree
-    glow, path = tree.nodes[_GLOW], tree.nodes.new("ShaderNodeLightPath")
-    strength = tree.nodes.new("ShaderNodeMath")
-    strength.operation = "MULTIPLY"
-    strength.inputs[1].default_value = glow.inputs["Strength"].default_value
-    tree.links.new(path.outputs["Is Camera Ray"], strength.inputs[0])
-    tree.links.new(strength.outputs[0], glow.inputs["Strength"])
 
 
 def show_camera_only(thing: Any) -> None:
     """Let an object be black for all rays but a camera's, and without its glow of ambient light.
 
-    What is clear stays so.
-
     With one bounce a ray that leaves a surface finds a light or nothing: direct light only.
     """
     tree = thing.data.materials[0].node_tree
-    strength = tree.nodes[_GLOW].inputs["Strength"]
-    for link in list(strength.links):
-        tree.links.remove(link)
-    strength.default_value = 0.0
+    tree.nodes[_GLOW].inputs["Strength"].default_value = 0.0
     path, mix = tree.nodes.new("ShaderNodeLightPath"), tree.nodes.new("ShaderNodeMixShader")
     black = tree.nodes.new("ShaderNodeBsdfDiffuse")
     black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-    dark = black.outputs[0]
-    if clear := tree.nodes.get(_CLEAR):
-        thinned = tree.nodes.new("ShaderNodeMixShader")
-        thinned.inputs[0].default_value = clear.inputs[0].default_value
-        tree.links.new(dark, thinned.inputs[1])
-        tree.links.new(clear.inputs[2].links[0].from_socket, thinned.inputs[2])
-        dark = thinned.outputs[0]
     end = next(node for node in tree.nodes if node.type == "OUTPUT_MATERIAL").inputs["Surface"]
     shown = end.links[0].from_socket
     tree.links.new(path.outputs["Is Camera Ray"], mix.inputs[0])
-    tree.links.new(dark, mix.inputs[1])
+    tree.links.new(black.outputs[0], mix.inputs[1])
     tree.links.new(shown, mix.inputs[2])
     tree.links.new(mix.outputs[0], end)
 

@@ -37,14 +37,11 @@ class Gloss:
         specular: of a dielectric, reflectance at normal incidence over 0.08; 0.5 is glass or
             plastic (refractive index 1.5), 0 leaves the Lambertian part alone.
         metal: the albedo is the reflectance at normal incidence, nothing is scattered below.
-        transmission: share of the light that passes straight through, as through a thin clear
-            sheet; the rest meets the surface. Depth and label are the sheet's.
     """
 
     roughness: Annotated[float, Interval(ge=0.1, le=1)] = 0.5
     specular: Share = 0.5
     metal: bool = False
-    transmission: Annotated[float, Interval(ge=0, le=0.95)] = 0.0
 
     @property
     def alpha(self) -> float:

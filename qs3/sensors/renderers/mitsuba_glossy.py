@@ -101,13 +101,10 @@ _MATT = Gloss(roughness=1.0, specular=0.0)
 # Fractional parts of the roots of 2, 3, 5 and 7 in 32 bit fixed point: a sequence in four
 # dimensions, which beside the pixel's R2 is one in six.
 _STEPS = (1779033703, 3144134277, 1013904242, 2773480762)
-_BOUNCE_STEPS = (1359893119, 2600822924)  # of 11 and 13
-_CLEAR_STEP = 528734636  # of 17
-_SHEETS = 8  # a ray passes through so many clear faces; the next one is as good as opaque
 
 
 class GlossyScene(JitScene):
-    """A scene for the compiled variants with `Body.gloss`, `Scene.area` and `Scene.bounces`.
+    """A scene for the compiled variants with `Body.gloss` and `Scene.area`.
 
     Its kernel is another one, so that scenes without either keep theirs, and its bytes.
     """
@@ -125,57 +122,36 @@ class GlossyScene(JitScene):
         self._metal = each([float(kind.metal) for kind in kinds])
         tables = np.concatenate([kept_back(kind) for kind in kinds])
         self._kept_back = mi.Float(tables.astype(np.float32))
-        self._clear = scene.clear
-        self._transmission = each([kind.transmission for kind in kinds])
-        self._bounces = scene.bounces
-        if scene.bounces and scene.projector is not None:
-            # What lights a surface from another one is blurred by far: the slide's mean will do,
-            # and carries no noise of dots.
-            self._slide_mean = self._opaque(float(scene.projector.slide.mean()))
         self._area = scene.area
         if scene.area is not None:
             self._area_axes, self._area_origin = self._pose(scene.area.world_from_light)
             self._area_half = self._opaque(scene.area.side_m / 2)
             self._area_radiance = self._opaque(scene.area.radiance)
 
-    def _lamp_samples(self, place: Any, seed: int) -> Callable[[Any], Any]:
-        """Numbers in 0..1 for each sample, by what they are for: see `_uses`."""
+    def _lamp_samples(self, place: Any, seed: int) -> Callable[[Any], list[Any]]:
+        """Numbers in 0..1 for each sample: two for a place on the area light, two for a facet."""
         mi, dr = self._mi, self._dr
+        if self._area is None:
+            return lambda index: []
 
-        def shifts(salt: int) -> Any:  # none of the salts is the pixel's own
+        def shifts(salt: int) -> Any:  # neither of the salts is the pixel's own
             return mi.sample_tea_32(place, dr.opaque(mi.UInt32, (seed ^ ~salt) % 2**32))
 
-        steps: dict[str, list[tuple[Any, int]]] = {}
-        if self._area is not None:  # a place on the light, and a facet
-            four = [*shifts(1), *shifts(2)]
-            steps["area"] = list(zip(four, _STEPS, strict=True))
-        if self._bounces:
-            steps["bounce"] = list(zip(shifts(3), _BOUNCE_STEPS, strict=True))
-        if self._clear:
-            steps["clear"] = [(shifts(4)[0], _CLEAR_STEP)]
-
-        def at(index: Any) -> dict[str, list[Any]]:
-            return {
-                use: [mi.Float(shift + index * mi.UInt32(step)) * TO_UNIT for shift, step in pairs]
-                for use, pairs in steps.items()
-            }
-
-        return at
+        pairs = list(zip([*shifts(1), *shifts(2)], _STEPS, strict=True))
+        return lambda index: [
+            mi.Float(shift + index * mi.UInt32(step)) * TO_UNIT for shift, step in pairs
+        ]
 
     def _shade(self, ray: Any, lamp: Any) -> Any:
         mi, dr = self._mi, self._dr
-        hit, point = self._first(ray, lamp)
-        numbers = [*lamp.get("area", ()), *lamp.get("bounce", ())]
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
 
         def none(face: Any, point: Any, way: Any, numbers: list[Any]) -> Any:
             return mi.Float(0)
 
         # A branch, not a mask: beside the object, which is much of a window, nothing is computed.
-        seen = hit.prim_index, point, mi.Vector3f(ray.d), numbers
-        there = hit.is_valid()
-        if self._clear:  # it may have passed the last face: `is_valid` still says what it met first
-            there &= dr.isfinite(hit.t)
-        return dr.if_stmt(seen, there, self._reflected, none)
+        seen = hit.prim_index, ray.o + hit.t * ray.d, mi.Vector3f(ray.d), lamp
+        return dr.if_stmt(seen, hit.is_valid(), self._reflected, none)
 
     def _reflected(self, face: Any, point: Any, way: Any, numbers: list[Any]) -> Any:
         """Radiance of a face at a point that is seen along `way`."""
@@ -192,89 +168,9 @@ class GlossyScene(JitScene):
             shine = facets.times_pi(dr.normalize(self._slide_origin - point))
             # Where the light is opposite to the eye there is no half-way.
             total += dr.select(projected > 0, (diffuse + shine) * projected, 0)
-        if self._bounces and self._projector is not None:
-            total += diffuse * self._from_surfaces(point, facing, valid, numbers[-2:])
         if self._area is not None:
-            total += self._from_area(point, facing, valid, numbers[:4], diffuse, facets)
+            total += self._from_area(point, facing, valid, numbers, diffuse, facets)
         return total
-
-    def _first(self, ray: Any, lamp: Any) -> tuple[Any, Any]:
-        """What a camera's ray meets, and where; it passes a clear face as often as light does."""
-        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
-        if not self._clear:
-            return hit, ray.o + hit.t * ray.d
-        mi, dr = self._mi, self._dr
-        # One number for all faces: what it is beyond a face's share is spread over 0..1 again.
-        number, begin, far = lamp["clear"][0], mi.Point3f(ray.o), mi.Float(hit.t)
-        for _ in range(_SHEETS):
-            valid = hit.is_valid()
-            share = self._share(hit.prim_index, valid)
-            passes = valid & (number < share)
-            number = dr.select(passes, number / dr.select(share > 0, share, 1), number)
-            begin = dr.select(passes, begin + (far + self._epsilon) * ray.d, begin)
-            further = self._scene.ray_intersect_preliminary(
-                mi.Ray3f(begin, ray.d), coherent=True, active=passes
-            )
-            hit.t = dr.select(passes, further.t, hit.t)
-            hit.prim_index = dr.select(passes, further.prim_index, hit.prim_index)
-            far = mi.Float(hit.t)
-        return hit, begin + far * ray.d
-
-    def _share(self, face: Any, valid: Any) -> Any:
-        """How much of the light passes through a face."""
-        mi, dr = self._mi, self._dr
-        body = dr.gather(mi.UInt32, self._body, face, valid)
-        return dr.select(valid, dr.gather(mi.Float, self._transmission, body, valid), 0)
-
-    def _arriving(
-        self, light: Any, source: Any, start: Any, active: Any, coherent: bool = True
-    ) -> Any:
-        """As in `JitScene`, and clear faces hold back a part."""
-        if not self._clear:
-            return super()._arriving(light, source, start, active, coherent)
-        mi, dr = self._mi, self._dr
-        way, passed = source - start, mi.Float(1)
-        step = self._epsilon * dr.rsqrt(dr.squared_norm(way))
-        done, looking = mi.Float(0), mi.Bool(active)  # done: of the way, 0..1
-        for _ in range(_SHEETS + 1):
-            ray = mi.Ray3f(start + done * way, way)
-            ray.maxt = 1 - 1e-4 - done
-            hit = self._scene.ray_intersect_preliminary(ray, coherent=coherent, active=looking)
-            looking &= hit.is_valid()
-            share = self._share(hit.prim_index, looking)
-            passed = dr.select(looking, passed * share, passed)
-            done = dr.select(looking, done + hit.t + step, done)
-            looking &= (share > 0) & (done < 1 - 1e-4)
-        # Where it still looks there are more sheets than it counts.
-        return dr.select(active & ~looking, light * passed, 0)
-
-    def _from_surfaces(self, point: Any, facing: Any, valid: Any, lamp: Any) -> Any:
-        """Light that a point gets from one surface in the projector's light, times 1 / pi.
-
-        The direction is drawn by the cosine, so that the mean over samples is the integral.
-        """
-        mi, dr = self._mi, self._dr
-        radius, angle = dr.sqrt(lamp[0]), 2 * dr.pi * lamp[1]
-        across, aside = mi.coordinate_system(facing)
-        up = dr.sqrt(clip(dr, 1 - lamp[0], 0, 1))
-        sin, cos = dr.sincos(angle)
-        way = mi.Vector3f(across * (radius * cos) + aside * (radius * sin) + facing * up)
-        ray = mi.Ray3f(point + facing * self._epsilon, way)
-        hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=valid)
-        met = valid & hit.is_valid()
-        normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, met)
-        albedo = dr.gather(mi.Float, self._albedo, hit.prim_index, met)
-        scattered = self._scattered(hit.prim_index, met, albedo)
-        light = self._projected(ray, ray.o + hit.t * ray.d, normal, met, self._slide_mean)
-        return dr.select(met, scattered * light, 0)
-
-    def _scattered(self, face: Any, valid: Any, albedo: Any) -> Any:
-        """Albedo of what a face scatters evenly: nothing of a metal, little of a clear face."""
-        mi, dr = self._mi, self._dr
-        body = dr.gather(mi.UInt32, self._body, face, valid)
-        metal = dr.gather(mi.Float, self._metal, body, valid)
-        clear = dr.gather(mi.Float, self._transmission, body, valid)
-        return dr.select(metal > 0, 0, albedo * (1 - clear))
 
     def _surface(
         self, face: Any, valid: Any, albedo: Any, normal: Any, to_eye: Any

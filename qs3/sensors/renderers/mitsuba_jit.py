@@ -169,18 +169,14 @@ class JitScene:
         normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, valid)
         return albedo * (light + self._projected(ray, ray.o + hit.t * ray.d, normal, valid))
 
-    def _projected(self, ray: Any, point: Any, normal: Any, valid: Any, slide: Any = None) -> Any:
-        """Radiance that the projector gives a white matt surface at `point`.
-
-        `slide`: taken for its brightness everywhere; None: what it is there.
-        """
+    def _projected(self, ray: Any, point: Any, normal: Any, valid: Any) -> Any:
+        """Radiance that the projector gives a white matt surface at `point`."""
         mi, dr = self._mi, self._dr
         to_light = self._slide_origin - point
         x, y, z = (-dr.dot(axis, to_light) for axis in self._slide_axes)
         place = mi.Point2f(x, y) / z * self._slide_scale + 0.5
         lit = valid & (z > 0) & dr.all((place >= 0) & (place <= 1))
-        if slide is None:
-            slide = self._slide.eval(place, lit)[0]
+        slide = self._slide.eval(place, lit)[0]
         cosine = dr.dot(normal, to_light)  # times the distance
         lit &= (slide > 0) & (cosine * dr.dot(normal, -ray.d) > 0)
 

@@ -3,27 +3,20 @@
 import numpy as np
 import pytest
 
-from qs3.sensors.matching import (
-    CensusMatcher,
-    NormalisedCorrelation,
-    SemiGlobalMatcher,
-    StereoBlockMatcher,
-)
+from qs3.sensors.matching import CensusMatcher, ReferenceMatcher, StereoBlockMatcher
 from qs3.sensors.matching.base import found_px
 from qs3.sensors.optics.visibility import Reason
 from tests.sensors.matching.textures import dots, seen
 
 MATCHERS = {
     "block": StereoBlockMatcher(64, 19),
-    "semi-global": SemiGlobalMatcher(64),
-    "correlation": NormalisedCorrelation(),
+    "correlation": ReferenceMatcher(9, 0, 64, 0),
     "census": CensusMatcher(64),
 }
 # Error of the median in one sub-pixel phase, rms of a pixel, mean of the medians over all phases.
 # Census has a test of its own.
 BARS = {
     "block": (0.05, 0.06, 0.01),
-    "semi-global": (0.13, 0.11, 0.01),  # steps of 1/16 px, stretched against locking
     "correlation": (0.04, 0.06, 0.005),
 }
 
@@ -50,8 +43,7 @@ def test_all_sub_pixel_phases_come_back(name):
 def test_a_search_finds_to_half_a_pixel_within_its_ends(name):
     make = {
         "block": StereoBlockMatcher(32, 19, min_disparity=8),
-        "semi-global": SemiGlobalMatcher(32, 8),
-        "correlation": NormalisedCorrelation(9, 8, 32),
+        "correlation": ReferenceMatcher(9, 8, 32, 0),
         "census": CensusMatcher(32, 8),
     }
     matcher, texture = make[name], dots(80, 300, 4)
@@ -90,24 +82,25 @@ def test_a_part_of_the_image_matches_as_the_whole_does(name):
     assert (np.abs(a - b)[both] < 0.07).mean() > 0.97
 
 
-@pytest.mark.parametrize("name", ["correlation", "census", "semi-global", "block"])
-def test_negative_disparities_for_a_stored_reference(name):
-    make = {
-        "correlation": lambda: NormalisedCorrelation(min_disparity=-32),
-        "census": lambda: CensusMatcher(64, min_disparity=-32),
-        "semi-global": lambda: SemiGlobalMatcher(64, min_disparity=-32),
-        "block": lambda: StereoBlockMatcher(64, 19, min_disparity=-32),
-    }[name]
+@pytest.mark.parametrize(
+    "matcher",
+    [
+        ReferenceMatcher(min_disparity=-32, steps_per_px=0),
+        CensusMatcher(64, min_disparity=-32),
+        StereoBlockMatcher(64, 19, min_disparity=-32),
+    ],
+)
+def test_negative_disparities_for_a_stored_reference(matcher):
     texture = dots(60, 300, 7)
     reference = seen(texture, 0).astype(np.float32)
     for true in (-14.0, 9.0):
         image = seen(texture, true, seed=3)[:, 90:210]
-        found = make().match(image, reference, first=90).disparity[12:-12, 12:-12]
+        found = matcher.match(image, reference, first=90).disparity[12:-12, 12:-12]
         assert np.isfinite(found).mean() > 0.9
         assert np.nanmedian(found) == pytest.approx(true, abs=0.07)
 
 
-@pytest.mark.parametrize("make", [StereoBlockMatcher, CensusMatcher, SemiGlobalMatcher])
+@pytest.mark.parametrize("make", [StereoBlockMatcher, CensusMatcher])
 def test_the_left_right_check_drops_what_the_other_camera_does_not_see(make):
     """A near bar hides a strip of the background from the right camera."""
     back, front = dots(60, 300, 8), dots(60, 300, 9)
@@ -122,3 +115,15 @@ def test_the_left_right_check_drops_what_the_other_camera_does_not_see(make):
     )
     assert np.isfinite(on).mean() < 0.5
     assert np.isfinite(on).mean() <= np.isfinite(off).mean()
+
+
+def test_block_matching_tells_dark_from_not_found():
+    texture = dots(60, 300, seed=12)
+    image, other = (seen(texture, d) for d in (20.0, 0.0))
+    image[:, 120:180] = 3
+    image[:, 200:240] = seen(dots(60, 300, seed=13), 0.0)[:, 200:240]
+    found = StereoBlockMatcher(64, 9).match(image, other)
+    assert (found.reason[8:-8, 130:170] == Reason.DARK).all()
+    foreign = found.reason[8:-8, 208:232]
+    assert (foreign == Reason.UNMATCHED).mean() > 0.5
+    assert (foreign != Reason.DARK).all()

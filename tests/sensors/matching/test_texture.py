@@ -9,7 +9,7 @@ from qs3.sensors.optics.infrared import GreyNoise, InfraredCamera
 from qs3.sensors.optics.visibility import Reason
 
 CAMERA = InfraredCamera(electrons_at_white=3000.0, read_noise_e=25.0)
-ASKED = TextureOverNoise(0.7, CAMERA.electrons_at_white, CAMERA.read_noise_e)
+ASKED = TextureOverNoise(0.7, CAMERA.noise(1.0))
 
 
 def picture(level, texture, seed=0):
@@ -36,7 +36,7 @@ def test_a_dim_pair_with_dots_matches_and_a_bright_one_without_does_not():
     """A threshold of grey values does the opposite."""
     rng = np.random.default_rng(1)
     quiet = InfraredCamera(electrons_at_white=20_000.0, read_noise_e=5.0)
-    asked = TextureOverNoise(0.7, quiet.electrons_at_white, quiet.read_noise_e)
+    asked = TextureOverNoise(0.7, quiet.noise(1.0))
     dots = (rng.random((60, 200)) < 0.1).astype(np.float32)
     dim = 6.0 + 5.0 * dots
     pair = [quiet.expose(np.roll(dim, -shift, axis=1), 1.0, rng) for shift in (0, 9)]
@@ -58,8 +58,8 @@ def test_an_amplified_picture_is_judged_by_its_own_noise():
     flat = np.full((120, 160), 1.0, np.float32)
     image = camera.expose(flat, 80.0, np.random.default_rng(0))
     moments = window_moments(image, 9)
-    asked = TextureOverNoise(0.7)
-    assert asked.at(camera.noise(10.0)).enough(*moments).mean() > 0.9
-    assert asked.at(camera.noise(80.0)).enough(*moments).mean() < 0.02
-    of_preset = for_picture(CensusMatcher(texture=asked), camera.noise(80.0))
-    assert of_preset.texture == asked.at(GreyNoise(camera.electrons_at_white / 8, 10.0))
+    matcher = CensusMatcher(texture=TextureOverNoise(0.7))
+    plain, amplified = (for_picture(matcher, camera.noise(gain)).texture for gain in (10.0, 80.0))
+    assert plain.enough(*moments).mean() > 0.9
+    assert amplified.enough(*moments).mean() < 0.02
+    assert amplified.noise == GreyNoise(camera.electrons_at_white / 8, 10.0)
