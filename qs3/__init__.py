@@ -1,8 +1,7 @@
 """qs3: from CAD meshes to a classifier that works on real depth scans.
 
 Implements QS3 (Chen et al., "Quasi-Balanced Self-Training on Noise-Aware Synthesis of
-Object Point Clouds", ECCV 2022). `qs3.load`, `qs3.train` and `qs3.generate` are described in
-`qs3.api`. Importing this package imports nothing heavy.
+Object Point Clouds", ECCV 2022). Importing this package imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -13,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 from qs3.utils.version import VERSION as __version__
 
 if TYPE_CHECKING:
-    from qs3.api import generate, load, train
+    from qs3.api import generate, train
+    from qs3.inference.predictor import load
 
 __all__ = ["__version__", "generate", "load", "train"]
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        return getattr(import_module("qs3.api"), name)
+        module = "qs3.inference.predictor" if name == "load" else "qs3.api"
+        return getattr(import_module(module), name)
     raise AttributeError(f"module 'qs3' has no attribute {name!r}")
 
 

@@ -16,8 +16,8 @@ COMMANDS: Commands = {
     "download": "qs3.commands.download:download",
     "inspect": "qs3.commands.inspect:inspect",
     "compare": "qs3.commands.inspect:compare",
-    "view": "qs3.commands.view:view",
-    "scannet": "qs3.commands.scannet:scannet",
+    "view": "qs3.commands.inspect:view",
+    "scannet": "qs3.commands.download:scannet",
     "predict": "qs3.commands.predict:predict",
     "export": "qs3.commands.predict:export",
     "report": {
@@ -26,15 +26,13 @@ COMMANDS: Commands = {
         "train": "qs3.commands.report:train",
         "keep": "qs3.commands.report:keep",
         "compare": "qs3.commands.report:compare",
-        "effects": "qs3.commands.report:effects",
         "judge": "qs3.commands.report:judge",
         "page": "qs3.commands.report:page",
-        "pictures": "qs3.commands.report:pictures",
         "pipeline": "qs3.commands.report:pipeline",
     },
     "leaderboard": "qs3.commands.report:leaderboard",
-    "bench": "qs3.commands.bench:bench",
-    "fit": "qs3.commands.fit:fit",
+    "bench": "qs3.commands.sensors:bench",
+    "fit": "qs3.commands.sensors:fit",
 }
 
 

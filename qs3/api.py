@@ -1,6 +1,4 @@
-"""The commands as functions, for notebooks: the words are those of the command line.
-
-import qs3
+"""Training and generation as functions, for notebooks: the words are those of the command line.
 
 qs3.generate("domain=modelnet10", "limit=5", "paths.data_dir=data")
 scan = qs3.generate(trimesh.load("chair.glb"), "domain=specklenet10", "renderer=mitsuba")
@@ -16,24 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 if TYPE_CHECKING:
-    import torch
     from omegaconf import DictConfig
 
     from qs3.generation.scan import Scan, Solid
-    from qs3.inference.predictor import Predictor
     from qs3.store.store import PointSet
 
 
 def train(*overrides: str) -> Path:
-    """Train a run as `python train.py <overrides>` does, in this process.
+    """Train a run as `python train.py <overrides>` does, in this process; returns its folder.
 
-    A finished run is not trained again. One seed at a time: there is no `-m` here.
-
-    Returns:
-        The run's folder; `qs3.report.run_files.read_run` and `qs3.load` read it.
-
-    Raises:
-        ConfigError, MissingDataError, ...: as the command says them.
+    `qs3.report.run_files.read_run` and `qs3.load` read it. A finished run is not trained again. One
+    seed at a time: there is no `-m` here. Errors are those of the command.
     """
     from omegaconf import OmegaConf
 
@@ -74,23 +65,14 @@ def generate(*arguments: Any) -> Any:
 
     Meshes: first one `trimesh.Trimesh`, `trimesh.Scene` or `qs3.meshes.mesh.Mesh`, or a list or a
     dict of them, then the words. They are metres with z up, as they stand, or with "up=y" y up
-    (trimesh leaves glTF files so). A scene's invisible collision nodes, such as `table_collider`,
-    are left out as those of files are, unless the words have "colliders=keep". Everything happens
-    in this process, and nothing is written. An object's bytes depend on the seed and on its id:
-    the key of a dict, "object" for a single mesh, "0", "1", ... in a list. With the id of a
-    dataset's object they are those of the dataset. What chooses among a dataset's objects (limit,
-    fraction, splits, scans) is refused.
+    (trimesh leaves glTF files so). Everything happens in this process, and nothing is written. An
+    object's bytes depend on the seed and on its id: the key of a dict, "object" for a single mesh,
+    "0", "1", ... in a list. With the id of a dataset's object they are those of the dataset.
 
     Returns:
         Of words the dataset; of a mesh a `qs3.generation.scan.Scan`; of a list or dict one each.
-
-    Raises:
-        ConfigError: a setting is wrong.
-        MeshError, DataError: a mesh is empty or gives too few points; names its id.
-        RenderError: the renderer cannot be used here.
     """
-    of_meshes = bool(arguments) and not isinstance(arguments[0], str)
-    if not of_meshes:
+    if not arguments or isinstance(arguments[0], str):
         from qs3.generation.command import generate as made
 
         with _as_hydra("generate", arguments) as cfg:
@@ -104,50 +86,6 @@ def generate(*arguments: Any) -> Any:
         named = {str(number): solid for number, solid in enumerate(solids)}
         return list(scan_meshes(named, overrides).values())
     return scan_meshes({"object": solids}, overrides)["object"]
-
-
-def load(
-    run: str | Path,
-    *,
-    device: str | torch.device = "cpu",
-    packages: Sequence[str] = ("qs3.models",),
-    prior: str | Mapping[str, float] | None = None,
-    prior_power: float = 0.5,
-) -> Predictor:
-    """The classifier that a finished run reports.
-
-        predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
-        probabilities = predictor([cloud_a, cloud_b])  # [2, classes] float64
-        predictor.classes  # their names, in that order
-        found = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
-
-    A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`). One that
-    knows sizes and heights, as "dgcnn-rooms" (`predictor.needs_floor`), takes metres and needs the
-    floor: `predictor(clouds, floor=0.0)`, `predictor.predict_depth(..., camera_height=1.2)`.
-
-    Args:
-        run: its folder, or the file result.pt of it, which needs nothing beside it; or a folder
-            that `qs3 export out=FOLDER` wrote; or the name of a classifier that comes with qs3,
-            "dgcnn-speckle".
-        device: where to run it: "cpu", "cuda", "cuda:1".
-        packages: where the net of the file may be defined. For a net of your own add your
-            package, if you trust it to be built with any arguments.
-        prior: how common classes are where the clouds come from: "rooms", as in ScanNet's, or
-            {"chair": 4, "bathtub": 0}, where those not named count as 1; None: as in training.
-        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.evaluation.prior`).
-
-    Returns:
-        See `qs3.inference.predictor.Predictor`.
-
-    Raises:
-        qs3.errors.MissingDataError: no finished run there.
-        qs3.errors.DataError: the file is damaged, or asks for something else than a net of
-            `packages`.
-        qs3.errors.ConfigError: no such device, or no such prior.
-    """
-    from qs3.inference.predictor import load as load_result
-
-    return load_result(run, device=device, packages=packages, prior=prior, prior_power=prior_power)
 
 
 @contextlib.contextmanager

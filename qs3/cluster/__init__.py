@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from qs3.config.compose import composed
+from qs3.config.compose import composed, override
 from qs3.config.hydra import build
-from qs3.config.quoting import override
 from qs3.utils.pool import Pool
 
 

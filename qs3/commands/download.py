@@ -1,4 +1,4 @@
-"""`qs3 download`: fetch a published dataset and put it where its domain looks for it."""
+"""`qs3 download` and `qs3 scannet`: published datasets, put where their domain looks for them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 import textwrap
 from pathlib import Path
 from typing import Annotated
+
+from annotated_types import Ge
 
 MIRROR = "QS3_DOWNLOAD_MIRROR"
 
@@ -22,9 +24,8 @@ def download(
     """Published datasets, put where their domain looks for them.
 
     Archives come to downloads/ in the data folder, what is in them to published/. On a mirror each
-    lies under the name that the list shows. What is in place is left alone. No hashes of these
-    files were published; of ModelNet10.zip the size is known, and .download.json in the folder
-    notes the SHA-256 of the archive.
+    lies under the name that the list shows. What is in place is left alone. .download.json in the
+    folder notes the SHA-256 of the archive.
 
     Example:
         qs3 download                              what there is
@@ -43,12 +44,10 @@ def download(
         return 1
     if name not in SOURCES:
         raise ConfigError(f"{name!r} cannot be downloaded; {meant(name, [*SOURCES, *BY_HAND])}")
-    source = SOURCES[name]
+    source, mirror = SOURCES[name], mirror or os.environ.get(MIRROR, "")
+    terms = {"accept_terms": accept_terms, "mirror": mirror, "root": root}
     try:
-        places = provide(
-            source, into, accept_terms=accept_terms, archive=archive, root=root,
-            mirror=mirror or os.environ.get(MIRROR, ""),
-        )  # fmt: skip
+        places = provide(source, into, archive=archive, **terms)
     except AgreementError as error:
         print(error)
         return 1
@@ -62,23 +61,57 @@ def listing() -> str:
     """All there is to fetch, for people."""
     from qs3.datasets.download import BY_HAND, SOURCES
 
-    def wrapped(text: str) -> list[str]:
-        return textwrap.wrap(text, 96, initial_indent="    ", subsequent_indent="      ")
-
     lines = ["qs3 download NAME   (--help for more)", ""]
+
+    def add(text: str) -> None:
+        lines.extend(textwrap.wrap(text, 96, initial_indent="    ", subsequent_indent="      "))
+
     for source in SOURCES.values():
         need = f" (accept_terms={source.agreement})" if source.agreement else ""
         lines.append(source.name)
-        for paragraph in (
-            source.title,
-            f"for {', '.join(f'domain={d}' for d in source.domains) or 'qs3-generate meshes='}",
-            f"size: {source.size_says}; file: {source.file}",
-            f"from: {source.address}",
-            f"terms: {source.terms}{need}",
-        ):
-            lines += wrapped(paragraph)
-    for asks in dict.fromkeys(one["asks"] for one in BY_HAND.values()):
-        lines += ["", f"By hand, {asks} (NAME prints how)"]
-        for name, one in BY_HAND.items():
-            lines += wrapped(f"{name}: {one['terms']}") if one["asks"] == asks else []
+        add(source.title)
+        add(f"for {', '.join(f'domain={d}' for d in source.domains) or 'qs3-generate meshes='}")
+        add(f"size: {source.size_says}; file: {source.file}; from: {source.address}")
+        add(f"terms: {source.terms}{need}")
+    lines += ["", "By hand (NAME prints how)"]
+    for name, one in BY_HAND.items():
+        add(f"{name}, {one['asks']}: {one['terms']}")
     return "\n".join(lines)
+
+
+def scannet(
+    *,
+    scans: Annotated[
+        Path,
+        "folder of scenes; in scene0000_00/ lie scene0000_00.sens, "
+        "scene0000_00_2d-instance-filt.zip, scene0000_00_2d-label-filt.zip and "
+        "scene0000_00.aggregation.json; the zips stay zips; 1.3 TB for all scenes",
+    ],
+    labels: Annotated[Path, "scannetv2-labels.combined.tsv, from the same download"],
+    train: Annotated[Path, "scannetv2_train.txt, of Tasks/Benchmark of github.com/ScanNet/ScanNet"],
+    val: Annotated[Path, 'scannetv2_val.txt, from there too; becomes the split "test"'],
+    out: Annotated[Path, "the dataset; domain=depthscannet10 expects data/depthscannet10"],
+    workers: Annotated[int, Ge(0), "processes; their number changes no byte"] = 1,
+    **more: Annotated[
+        str,
+        "fields of qs3.datasets.scannet.ScanNet: min_points=1000 views=10 stride=1 on_error=skip",
+    ],
+) -> None:
+    """DepthScanNet10 from raw ScanNet: objects cropped from the depth images.
+
+    Accept ScanNet's terms of use first, http://www.scan-net.org. Defaults are those of the paper
+    where it names one. Run the same command again after an interruption, or when a damaged scene
+    is mended: it continues. on_error=skip leaves damaged scenes out, and manifest.csv says why.
+
+    Example:
+        qs3 scannet scans=SCANS labels=TSV train=TXT val=TXT out=data/depthscannet10
+    """
+    from qs3.classes import CLASSES
+    from qs3.config.hydra import build
+    from qs3.datasets.importing import import_into
+
+    lists = {"labels": labels, "train": train, "val": val}
+    node = {"_target_": "qs3.datasets.scannet.ScanNet", "folder": str(scans), "workers": workers}
+    node |= {key: str(path.absolute()) for key, path in lists.items()}
+    importer = build({**node, **more})
+    import_into(out, importer, name=out.name, classes=CLASSES)

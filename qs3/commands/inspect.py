@@ -1,22 +1,27 @@
-"""`qs3 inspect` and `qs3 compare`: what datasets are like."""
+"""`qs3 inspect`, `qs3 compare` and `qs3 view`: what datasets are like, and what they look like."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from annotated_types import Ge
+from annotated_types import Ge, Interval
 
 _OUT = Path("out/inspection")
 _TURNABLE = 50  # clouds on the page where they can be turned
 
+_Data = Annotated[str | None, "where datasets lie, paths.data_dir of a run"]
+_Domain = Annotated[str, "of conf/domain, or a dataset's folder"]
+_Seed = Annotated[int, Ge(0), "of all random draws"]
+
 
 def inspect(
-    domain: Annotated[str, "of conf/domain, or a dataset's folder"],
+    domain: _Domain,
     *,
-    data_dir: Annotated[str | None, "where datasets lie, paths.data_dir of a run"] = None,
+    data_dir: _Data = None,
     sample: Annotated[int, Ge(1), "clouds measured one by one; of more, some are drawn"] = 3000,
-    seed: Annotated[int, Ge(0), "of all random draws"] = 0,
+    seed: _Seed = 0,
     out: Annotated[Path | None, "where text and pictures go (out/inspection/NAME)"] = None,
     **overrides: Annotated[str, "of the domain's config, e.g. published.folder=PATH"],
 ) -> None:
@@ -26,8 +31,7 @@ def inspect(
     from train to test, odd objects; a contact sheet of all classes and a page where clouds can be
     turned. Published files are imported first.
 
-    Examples:
-        qs3 inspect modelnet10
+    Example:
         qs3 inspect domain=own published.folder=scans
         qs3 inspect data/specklenet10 variant=points_clean
     """
@@ -52,11 +56,11 @@ def inspect(
 
 
 def compare(
-    a: Annotated[str, "of conf/domain, or a dataset's folder"],
+    a: _Domain,
     b: Annotated[str, "another one"],
     *,
-    data_dir: Annotated[str | None, "where datasets lie, paths.data_dir of a run"] = None,
-    seed: Annotated[int, Ge(0), "of all random draws"] = 0,
+    data_dir: _Data = None,
+    seed: _Seed = 0,
     out: Annotated[Path | None, "where text and picture go (out/inspection/A-B)"] = None,
     **overrides: Annotated[str, "of both domains' configs; a.KEY and b.KEY of one"],
 ) -> None:
@@ -66,8 +70,7 @@ def compare(
     surface and how much of it was measured (of generated datasets), how well clouds tell their
     domain; one object of each class from both, as a picture.
 
-    Examples:
-        qs3 compare modelnet10 specklenet10
+    Example:
         qs3 compare specklenet10 specklenet10 a.variant=points_clean
         qs3 compare roomscan10 objects b.published.file=FILE b.published.fold=0
     """
@@ -94,8 +97,52 @@ def compare(
     print(f"{text}\nsaved comparison.json, comparison.md and clouds.png in {folder}")
 
 
-def _with(data_dir: str | None, overrides: dict[str, str]) -> dict[str, str]:
-    return ({"paths.data_dir": data_dir} if data_dir else {}) | overrides
+def view(
+    path: Annotated[str, "what to show"],
+    *paths: Annotated[str, "more of them"],
+    out: Annotated[Path, "the page"] = Path("view.html"),
+    clouds: Annotated[int, Interval(ge=1, le=500), "at most so many"] = 50,
+    points: Annotated[int | None, Interval(ge=1, le=200_000), "of each cloud"] = None,
+    colour: Annotated[
+        Literal["", "height", "view", "residual", "class", "confidence"], "shown first"
+    ] = "",
+    match: Annotated[str, "only clouds with this in their names"] = "",
+    up: Annotated[Literal["x", "y", "z", "-x", "-y", "-z"], "of files: what points up"] = "z",
+    variant: Annotated[str, "of a dataset, such as points_clean"] = "",
+    data_dir: Annotated[Path | None, "of runs and domains: where their data are"] = None,
+) -> int:
+    """Clouds on a page where they can be turned.
+
+    A path is a file of clouds in any format of `qs3 predict`, a mesh, an archive of objects, a
+    folder of files, the folder of a dataset or the name of a domain, or the folder of a finished
+    run: its most confident errors come first. Of more clouds than clouds=, and of more points than
+    points=, some are drawn at random, always the same ones.
+
+    The page is one file that needs neither a network nor qs3. Drag to turn, click to enlarge, find
+    by words such as "chair" or "wrong". Colours: height; the view that saw a point; residual, the
+    distance of a point to the true surface, where the dataset knows it; class; confidence.
+
+    A damaged file is named and the others go on; the exit status is then 1.
+
+    Example:
+        qs3 view chair.ply other/chair.ply points=20000
+        qs3 view data/specklenet10 match=chair colour=residual
+        qs3 view logs/qs3_s2d/seed0-5f0c2a71 out=errors.html
+    """
+    from qs3.report.view import Wanted
+    from qs3.report.view import view as page
+    from qs3.utils.files import write_text
+
+    wanted = Wanted(match, up, variant, data_dir, points)
+    text, about, failed = page([path, *paths], clouds, colour, wanted)
+    write_text(out, text)
+    print(*about, *(f"not read: {words}" for words in failed), sep="\n")
+    print(f"saved {out}, {len(text) / 1e6:.2f} MB; open it in a browser")
+    return 1 if failed else 0
+
+
+def _with(data_dir: str | None, overrides: Mapping[str, str]) -> dict[str, str]:
+    return {**({"paths.data_dir": data_dir} if data_dir else {}), **overrides}
 
 
 def _name(name: str, variant: str) -> str:

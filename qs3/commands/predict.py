@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,8 +33,7 @@ def predict(
     prior: Annotated[str, "how common classes are: rooms, or CLASS:N,CLASS:N"] = "",
     prior_power: Annotated[float, Ge(0), "how much of that is believed: 0 nothing, 1 all"] = 0.5,
     part: Annotated[str, "of an archive (default: adapt, or all but judge), or all"] = "",
-    sample: Annotated[int | None, Ge(1), "only so many objects, drawn at random"] = None,
-    out: Annotated[Path, "table, .csv or .json"] = Path("predictions.csv"),
+    out: Annotated[Path, "table, .csv"] = Path("predictions.csv"),
     page: Annotated[bool, "also a page with pictures, .html"] = True,
     batch_size: Annotated[int, Ge(1), "clouds that the net sees at a time"] = 16,
     threads: Annotated[int | None, Ge(1), "batches at the same time (default: processors)"] = None,
@@ -48,30 +46,23 @@ def predict(
     sizes and heights and is right more often, if floor= or camera_height= is given, else
     dgcnn-speckle, for clouds in any unit; second=pointnet-speckle then.
 
-    CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of
-    points, any unit, any place. A net that knows sizes takes them as metres; one that knows heights
-    needs floor=, 0 if objects stand on z = 0. Which way is up is not guessed, and the wrong axis
-    costs most of the accuracy. Labels: the file's own, or a folder called as a class.
+    CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders. A net that knows
+    sizes takes them as metres; one that knows heights needs floor=, 0 if objects stand on z = 0.
+    Which way is up is not guessed. Labels: the file's own, or a folder called as a class.
 
     DEPTH IMAGES are .png of 16 bits, in millimetres, or .npy; 0 and 65535 are not measured. A mask
     has 0 where no object is and a number for each object. up=x,y,z is up in the camera's frame (x
     right, y down, z forward), at any length; -y is a level camera. Without it the planes of the
     picture tell, else the camera counts as level.
 
-    prior=rooms takes classes as common as in ScanNet's rooms (42 % chairs), prior=chair:4,bathtub:0
-    as in your place: others count as 1, 0 is never.
-
     A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status,
     class, confidence, second (the class by another net), label, points, dropped (NaN, infinite or
-    0 0 0: without depth), tier (clean, hard, or poor), caution, up, out_of_range, reason, and
-    p_<class> of each class.
-
-    out_of_range=yes: a cloud unlike those of training. An object of no known class also gets a
+    0 0 0: without depth), tier (clean, hard, or poor), caution, up, out_of_range (unlike the clouds
+    of training), reason, and p_<class> of each class. An object of no known class also gets a
     class, often with high confidence. A damaged file gets status=failed and its reason, and the
     others go on; the exit status is then 1.
 
     Example:
-        qs3 predict scans
         qs3 predict scans ckpt=logs/own_scans/seed0-5f0c2a71
         qs3 predict depth=frame.png mask=mask.png intrinsics=525,525,319.5,239.5 camera_height=1.2
         qs3 predict ckpt=RUN depth=a.npy box=210,95,480,430 intrinsics=cam.yaml up=0,-0.97,-0.24
@@ -82,64 +73,63 @@ def predict(
     from qs3.inference import predict as steps
     from qs3.inference.predictor import load
     from qs3.utils.files import write_text
+    from qs3.utils.processor import cores
     from qs3.utils.progress import progress_bar
+    from qs3.utils.text_table import printable
 
     if (input is None) == (depth is None):
         raise ConfigError("give input=PATH for clouds, or depth=PATH for depth images")
     floor = floor if camera_height is None else -camera_height
     name = ckpt or (model_file.ANY_SIZE if floor is None else model_file.HEIGHTS)
-    how: dict[str, Any] = {
-        "device": device,
-        "packages": (*model_file.PACKAGES, *packages),
-        "prior": prior or None,
-        "prior_power": prior_power,
-    }
+    how: dict[str, Any] = {"device": device, "packages": (*model_file.PACKAGES, *packages)}
+    how |= {"prior": prior or None, "prior_power": prior_power}
     first = load(name, **how)
     other = second or ("none" if ckpt else model_file.SECOND)
     asked = None if other == "none" else steps.second_opinion(other, first, floor, **how)
-    if input is not None:
+    if depth is None:
+        assert input is not None
         found = inputs.clouds(input, up or "z", part, first.classes)
     else:
-        assert depth is not None
         pictures = (depth, mask, box, intrinsics, depth_scale, up, first.result.gravity)
         found = inputs.depth_images(*pictures)
-    units = found.units if sample is None else inputs.drawn(found.units, sample)
-    rows, gallery = [], pages.Gallery(first.classes)
-    threads, began = threads or len(os.sched_getaffinity(0)), time.monotonic()
-    with progress_bar(f"{found.kind}s read", total=len(units)) as advance:
-        told = (first.floor(floor), asked, batch_size, threads, advance)
-        for row, of in steps.predict_units(first, units, *told):
-            rows.append(row)
-            if of and page:
-                gallery.add(row, of)
-    rate = len(rows) / max(time.monotonic() - began, 1e-9)
+    samples, shown, began = [], [], time.monotonic()
+    with progress_bar(f"{found.kind}s read", total=len(found.units)) as advance:
+        told = (first.floor(floor), asked, batch_size, threads or len(cores()), advance)
+        for one in steps.predict_units(first, found.units, *told):
+            samples.append(one)
+            shown += [one] * bool(one.cls)
+            if len(shown) > pages.MOST_SHOWN + batch_size:
+                shown = pages.first_of(shown, first.classes)
+    rate = len(samples) / max(time.monotonic() - began, 1e-9)
     notes = steps.notes(first, found.kind, floor is not None)
-    share, data = steps.expected(rows, first), steps.trained_on(name)
+    data, worth = steps.trained_on(name), first.result.worth
+    verdict = in_words(steps.expected(samples, first))
     lines = [
         *([] if ckpt else [f"classifier: {name}, which comes with qs3 (ckpt=)"]),
         *notes,
-        f"{len(rows)} clouds, {rate:.1f} clouds a second, from {len(units)} {found.kind}s",
+        f"{len(samples)} clouds, {rate:.1f} clouds a second, from {len(found.units)} {found.kind}s",
         *found.notes,
-        *steps.summary(rows, first.classes),
-        *filter(None, [in_words(share)]),
-        *steps.agreement(rows, first.classes),
+        *steps.summary(samples, first.classes),
+        *([verdict] if verdict else []),
         *([f"the classifier's data: {data}"] if data else []),
-        *([f"accuracy on real objects: {first.result.worth}"] if first.result.worth else []),
+        *([f"accuracy on real objects: {worth}"] if worth else []),
         f"saved {out}",
     ]
-    shares = first.prior.shares if first.prior else None
-    about = {"target": first.result.target, "expected": share, "prior": shares}
-    as_json = table.as_json(rows, first.classes, **about)
-    write_text(out, as_json if out.suffix == ".json" else table.as_csv(rows, first.classes))
+    write_text(out, table.as_csv(samples, first.classes))
     if page:
-        title = f"{(input or depth or Path()).absolute().name}, as {name} sees it"
-        height = first.floor(floor) if first.needs_floor else None
-        texts = (data, first.result.worth, notes, in_words(share), height)
-        html = pages.page(inputs.printable_name(title), rows, gallery, first.classes, *texts)
+        about = {"trained_on": data, "worth": worth, "notes": notes, "verdict": verdict}
+        html = pages.page(
+            printable(f"{(input or depth or Path()).absolute().name}, as {name} sees it"),
+            samples,
+            pages.first_of(shown, first.classes),
+            first.classes,
+            first.floor(floor) if first.needs_floor else None,
+            **about,
+        )
         write_text(out.with_suffix(".html"), html)
         lines.append(f"saved {out.with_suffix('.html')}")
-    print("\n".join(map(inputs.printable_name, lines)))
-    return int(any(row.probabilities is None for row in rows))
+    print("\n".join(map(printable, lines)))
+    return int(not all(one.cls for one in samples))
 
 
 def export(
@@ -151,23 +141,18 @@ def export(
 ) -> None:
     """A trained net for use without qs3 (ONNX, torch.export), or as a folder to publish.
 
-    It takes prepared clouds [clouds, points, 3] and gives logits; how a cloud is prepared, and the
-    names of the classes, are in the .onnx file's metadata. The written net is run on made-up clouds
-    and its logits compared with the net's.
-
-    A folder gets model.safetensors, config.json (settings, and the weights' SHA-256) and README.md,
-    the model's card with the run's data, command and accuracy: the layout of model hubs. qs3.load
-    and `qs3 predict ckpt=FOLDER` read it; nothing in it is run.
+    A file takes prepared clouds [clouds, points, 3] and gives logits; how a cloud is prepared, and
+    the names of the classes, are in the .onnx file's metadata. It is run on made-up clouds and its
+    logits compared with the net's. A folder gets model.safetensors, config.json and README.md, the
+    model's card: the layout of model hubs. qs3.load and `qs3 predict ckpt=FOLDER` read it.
 
     Example:
         qs3 export logs/own_scans/seed0-5f0c2a71 out=model.onnx
-        qs3 export ckpt=result.pt out=model.pt2
-        qs3 export ckpt=logs/own_scans/seed0-5f0c2a71 out=my-classifier
+        qs3 export logs/own_scans/seed0-5f0c2a71 out=my-classifier
     """
     from qs3.inference.export import export_file, export_folder
     from qs3.inference.model_file import PACKAGES
 
     allowed = (*PACKAGES, *packages)
-    print(
-        export_file(ckpt, out, allowed) if out.suffix else export_folder(ckpt, out, half, allowed)
-    )
+    file = bool(out.suffix)
+    print(export_file(ckpt, out, allowed) if file else export_folder(ckpt, out, half, allowed))

@@ -1,9 +1,11 @@
-"""Hydra's compose on the project's conf/, in any process and inside a Hydra application too."""
+"""Hydra's compose on the project's conf/ in any process, and values as words for it."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qs3.config.location import CONF
@@ -64,3 +66,26 @@ def choices(group: str) -> list[str]:
 def first_line(error: BaseException) -> str:
     """The first line of an error's message; its kind if it has none."""
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
+def override(key: str, value: str | Path) -> str:
+    """`key=value` for a value that is text and nothing else, such as the name of a folder."""
+    # OmegaConf's way to say that `${` begins no interpolation; backslashes before it are doubled.
+    text = re.sub(r"(\\*)\$\{", lambda found: rf"{found[1]}{found[1]}\${{", str(value))
+    return f"{key}={quoted(text)}"
+
+
+def quoted(text: str) -> str:
+    """Text in quotes where Hydra would read something else; an interpolation stays one.
+
+    Unquoted, a comma makes a sweep of a word, brackets a list, and digits a number.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.core.override_parser.types import Quote, QuotedString
+    from hydra.errors import HydraException
+
+    try:
+        read: Any = OverridesParser.create().parse_override(f"key={text}").value()
+    except HydraException:
+        read = None
+    return text if read == text else QuotedString(text, Quote.single).with_quotes()

@@ -14,7 +14,7 @@ from lightning.pytorch.plugins.io import CheckpointIO
 
 from qs3.runs.checkpoints import LAST, load, save
 from qs3.runs.metrics import Times
-from qs3.utils.processor_time import Moment, processor_seconds
+from qs3.utils.processor import Moment, processor_seconds
 
 
 class AtomicCheckpointIO(CheckpointIO):

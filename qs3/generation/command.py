@@ -88,7 +88,7 @@ def generate(cfg: DictConfig) -> PointSet:
         keep=plan.keep(folder),
         save=partial(save_part, parts),
     )
-    with owned(folder, doing="making the dataset in", advice=f"or give another {_ELSEWHERE}"):
+    with owned(folder, doing="making the dataset in"):
         renderer = renderer_provenance(job)
         recipe = plan.describe(renderer)
         if plan.options.force:  # not before: without a renderer nothing would take its place

@@ -1,6 +1,7 @@
 """A trained net as one file that needs no qs3: .pt2 for `torch.export.load`, .onnx for runtimes.
 
-Or as a folder to publish (`qs3.inference.model_file`).
+Or as a folder to publish (`qs3.inference.model_file`) with a card: what the classifier is, how
+accurate it was, what it lacks.
 """
 
 from __future__ import annotations
@@ -25,13 +26,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, Qs3Error
-from qs3.inference.model_card import card
+from qs3.evaluation.validators import chosen_in_words
 from qs3.inference.model_file import (
     CARD,
     CONFIG,
     EXPORTED,
     PACKAGES,
     WEIGHTS,
+    Result,
     build_net,
     find_result,
     read_result,
@@ -40,8 +42,9 @@ from qs3.inference.model_file import (
 from qs3.inference.predictor import Predictor, load
 from qs3.kernels.norms import use_trained
 from qs3.models.base import PointClassifier
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.utils.files import atomic_path, make_folder
+from qs3.utils.page import render
 from qs3.utils.version import VERSION
 
 ALLOWED = 1e-4  # difference of logits
@@ -56,9 +59,8 @@ _FEATURES = "qs3.models.features.features"  # a head on a file that has no place
 class Comparison:
     """The exported net's logits and the net's own.
 
-    Sums in another order differ in their last digits. Where two neighbours or farthest points are
-    equally far but for these, a net may take the other one, and a cloud's logits differ by more;
-    that happens to single clouds, an error to all.
+    Where two neighbours or farthest points are equally far but for their last digits, a net may
+    take the other one: that happens to single clouds, an error to all.
 
     Attributes:
         clouds: compared.
@@ -112,14 +114,10 @@ def export_folder(
 
     Args:
         ckpt: what is exported; of an exported folder its card is carried over.
-        folder: where to.
+        folder: where to; what lies there of something else stays, and is a ConfigError.
         half: matrices as numbers of 16 bits: half the size, and other probabilities in the fourth
             digit. They count as 32 bits again when the net is built.
         packages: where the net may be defined; the code there is run.
-
-    Raises:
-        ConfigError: the folder holds a README.md or config.json of something else, or the result;
-            or the net needs a file that would not be in it.
     """
     file, result = find_result(ckpt), read_result(ckpt)
     if result.model["_target_"] == _FEATURES:
@@ -133,10 +131,11 @@ def export_folder(
             for name, value in result.weights.items()
         }
         result = dataclasses.replace(result, weights=weights)
-    metrics, beside = read_metrics(file.parent), file.with_name(CARD)
-    text = card(result, metrics, _command(file.parent))
-    if file.name == WEIGHTS and beside.is_file():
-        text = beside.read_text("utf-8")
+    known = file.with_name(CARD)
+    if file.name == WEIGHTS and known.is_file():
+        text = known.read_text("utf-8")
+    else:
+        text = card(result, read_metrics(file.parent), _command(file.parent))
     build_net(result, packages)  # before anything is written
     write_folder(folder, result, text)
     size = (folder / WEIGHTS).stat().st_size / 1e6
@@ -144,6 +143,30 @@ def export_folder(
         f"saved {folder}: {WEIGHTS} ({size:.1f} MB), {CONFIG} and {CARD}\n"
         f"qs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it; read {CARD}, which is "
         "the model's card, before you publish it"
+    )
+
+
+def card(result: Result, metrics: RunMetrics | None, command: str = "") -> str:
+    """The model's card as Markdown; without its run's metrics it has no figures.
+
+    The interval of the accuracy is Wilson's at 95 % ("Probable inference", JASA 22, 1927).
+    """
+    interval = None
+    if metrics and metrics.final.accuracy is not None:
+        from scipy.stats import binomtest
+
+        right, of = round(metrics.final.accuracy * metrics.final.n), metrics.final.n
+        found = binomtest(right, of).proportion_ci(method="wilson")
+        interval = (100 * found.low, 100 * found.high)
+    return render(
+        "card.md",
+        net=result.model["_target_"].rpartition(".")[2],
+        result=result,
+        own=result.own_module,
+        metrics=metrics,
+        chosen=chosen_in_words(metrics.selection.teacher) if metrics else "",
+        interval=interval,
+        command=command,
     )
 
 
@@ -163,11 +186,8 @@ def export(
 ) -> Comparison:
     """Write the net to `out`, read it back, and compare it with the net, one cloud and many.
 
-    `clouds`: prepared ones to compare on; None makes some up.
-
-    Raises:
-        ConfigError: another kind of file.
-        Qs3Error: torch cannot export this net, or the logits differ: then there is no file.
+    `clouds`: prepared ones to compare on; None makes some up. Where torch cannot export the net, or
+    the logits differ, there is no file and a Qs3Error.
     """
     if out.suffix not in EXPORTED:
         raise ConfigError(f"out={out} must end in {' or '.join(EXPORTED)}, or be a folder")
@@ -224,11 +244,8 @@ def made_up(points: int, count: int = _CHECKED) -> Float[Tensor, "n m 3"]:
 def metadata(predictor: Predictor) -> dict[str, str]:
     """What using the net takes besides its weights; stands in the ONNX file's metadata_props."""
     result = predictor.result
-    upright = result.gravity == "z"
-    unit, scaling = (
-        "none: clouds are scaled to the unit ball",
-        ", divide by the largest distance from it",
-    )
+    unit = "none: clouds are scaled to the unit ball"
+    scaling = ", divide by the largest distance from it"
     if predictor.in_metres:
         unit, scaling = "metre: clouds keep their size", ""
     if predictor.needs_floor:
@@ -238,7 +255,7 @@ def metadata(predictor: Predictor) -> dict[str, str]:
         "classes": json.dumps(list(predictor.classes)),
         "points": str(predictor.points),
         "any_number_of_points": str(any_points(predictor)).lower(),
-        "up": "z" if upright else "none (frame of the camera)",
+        "up": "z" if result.gravity == "z" else "none (frame of the camera)",
         "target": result.target,
         "unit": unit,
         "stored_points": str(result.stored_points),
@@ -254,11 +271,10 @@ def metadata(predictor: Predictor) -> dict[str, str]:
 
 def _shapes(predictor: Predictor) -> tuple[dict[int, Any]]:
     """Which axes of the input are free."""
-    free: dict[int, Any] = {0: torch.export.Dim("clouds", min=1, max=_MOST_CLOUDS)}
+    net, free = predictor.net, {0: torch.export.Dim("clouds", min=1, max=_MOST_CLOUDS)}
     if any_points(predictor):
-        net: Any = predictor.net
-        least = net.backbone.least_points
-        free[1] = torch.export.Dim("points", min=least, max=_MOST_POINTS)
+        assert isinstance(net, PointClassifier)
+        free[1] = torch.export.Dim("points", min=net.backbone.least_points, max=_MOST_POINTS)
     return (free,)
 
 

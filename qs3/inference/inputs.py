@@ -1,6 +1,6 @@
 """What `qs3 predict` reads: files of clouds, an archive of cut objects, or depth images.
 
-All of them become `Sample`s, one after the other; what cannot be read becomes a failed `Row`, and
+All of them become `Sample`s, one after the other; what cannot be read is a sample that failed, and
 the others go on.
 """
 
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
-from qs3.datasets.clouds import SUFFIXES, CloudFile, npy_clouds, parse_clouds, with_depth
+from qs3.datasets.clouds import SUFFIXES, CloudFile, parse_clouds, with_depth
 from qs3.datasets.cutting import Piece, faults
 from qs3.datasets.depth_images import (
     Intrinsics,
@@ -27,12 +28,11 @@ from qs3.datasets.depth_images import (
     read_intrinsics,
     read_mask,
 )
-from qs3.datasets.importing import UP_AXES
+from qs3.datasets.importing import UP_AXES, turned
 from qs3.datasets.object_archive import ADAPT, JUDGE, Archive, is_archive, read_archive
 from qs3.datasets.pointed import RULES, Caution, point_out
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.geometry.sampling import surface_sample
-from qs3.inference.table import Row
 from qs3.meshes.io import is_mesh, load_mesh
 from qs3.utils.text_table import printable
 
@@ -40,63 +40,79 @@ ALL = "all"
 """For `part=`: every object of an archive."""
 
 _IMAGES = (".png", ".npy")
-_SEVERAL = (".npz", ".h5", ".hdf5")  # may hold several clouds, and are read to count them
 _ON_MESH = 8192  # points; nets take some of them, as far apart as can be
+_MARGIN = 0.35  # of an object's larger side, shown around it
 
 
-class Sample(NamedTuple):
-    """A cloud as read, and what is known of it; see `Row`.
+@dataclass(eq=False)
+class Sample:
+    """One object: what was read of it and, once it is predicted, what a classifier says.
 
     Attributes:
-        name: in the table.
-        cloud: [n, 3], `axis` up.
-        dropped: points that were left out.
-        axis: that points up in it.
-        picture: the depth image and the object's pixels in it; None if it comes from none.
-        world_from_camera: the rotation to z up of a cloud in the frame of its camera; None: `axis`
-            is up.
+        name: relative to the input; name[3] is cloud 3 of a file that holds several, or object 3 of
+            a depth image's mask.
+        cloud: [n, 3], `axis` up; None if it failed, or when it is not needed any more.
+        dropped: points left out: without depth or marked as stray; of a depth image the object's
+            pixels without depth. None if it could not be read.
+        axis: the axis of `cloud` that points up.
+        label: what it is, if that is known: a class of the net's, or another word; "" if not.
+        tier: of an object cut from a depth image: "clean", "hard" or "poor"; "" of other clouds.
+        cautions: what was wrong when it was cut, and what is not sure about the picture.
+        up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
+        picture: the depth image around the object, and the object's pixels in it.
+        world_from_camera: the rotation to z up of a cloud in the frame of its camera.
+        points: of the cloud; None if it could not be read.
+        reason: in what it is out of range, or why it failed; "" otherwise.
+        probabilities: [C] float64; None if it failed.
+        without_prior: the same, with classes as common as in training.
+        cls: the likeliest class; "" if it failed.
+        second: the class that another classifier names; "" without one.
     """
 
     name: str
-    cloud: np.ndarray
-    dropped: int
+    cloud: Float[np.ndarray, "n 3"] | None = None
+    dropped: int | None = None
     axis: str = "z"
     label: str = ""
     tier: str = ""
     cautions: tuple[Caution, ...] = ()
-    up: str = "z"
+    up: str = ""
     picture: tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]] | None = None
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
+    points: int | None = None
+    reason: str = ""
+    probabilities: Float[np.ndarray, " c"] | None = None
+    without_prior: Float[np.ndarray, " c"] | None = None
+    cls: str = ""
+    second: str = ""
 
-    def row(self, reason: str, probabilities: np.ndarray | None) -> Row:
-        """Its row of the table, with the net's prediction or the reason why there is none."""
-        return Row(
-            self.name,
-            len(self.cloud),
-            self.dropped,
-            reason,
-            probabilities,
-            self.label,
-            self.tier,
-            self.cautions,
-            self.up,
-        )
+    def __post_init__(self) -> None:
+        if self.cloud is not None:
+            self.points = len(self.cloud)
 
+    @property
+    def confidence(self) -> float:
+        """The probability of `cls`, in [0, 1]; NaN if it failed."""
+        return float("nan") if self.probabilities is None else float(self.probabilities.max())
 
-class Unit(NamedTuple):
-    """One file, one depth image or one object of an archive: its objects, and their number.
+    @property
+    def upright(self) -> Float[np.ndarray, "n 3"]:
+        """The cloud with z up, whatever frame a net sees it in."""
+        cloud = np.empty((0, 3)) if self.cloud is None else np.asarray(self.cloud, np.float64)
+        if self.world_from_camera is not None:
+            return cloud @ np.asarray(self.world_from_camera).T
+        return turned(cloud[:, :3], self.axis)
 
-    They are counted by what is cheap to read: masks, headers of arrays.
-    """
-
-    read: Callable[[], Iterator[Sample | Row]]
-    size: Callable[[], int]
+    def failed(self, error: Qs3Error | str, file: str = "") -> Sample:
+        """The same, with the reason; the file's name before it has a column of its own."""
+        self.cloud, self.reason = None, printable(str(error).removeprefix(file).lstrip(" :,"))
+        return self
 
 
 class Inputs(NamedTuple):
-    """All units, what they are called, and what to print about them."""
+    """What to read, one after the other, what one of it is called, and what to print about it."""
 
-    units: Sequence[Unit]
+    units: Sequence[Callable[[], Iterator[Sample]]]
     kind: str
     notes: Sequence[str] = ()
 
@@ -108,36 +124,21 @@ def find_files(
 
     In a folder: all files with these suffixes at any depth, in order of their names; hidden ones
     and links to folders are left out.
-
-    Raises:
-        MissingDataError: nothing there.
     """
     if place.is_file():
         return [place], place.parent, Counter()
-    found: list[Path] = []
-    others: Counter[str] = Counter()
-    for folder, folders, names in os.walk(place, onerror=_stop):
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
-        for name in names:
-            suffix = os.path.splitext(name)[1].lower()
-            if suffix in suffixes and not name.startswith("."):
-                found.append(Path(folder, name))
-            elif not name.startswith("."):
-                others[suffix] += 1
+    there: list[Path] = []
+
+    def stop(error: OSError) -> None:  # `os.walk` would leave out a folder that cannot be read
+        raise MissingDataError(f"{error.filename} cannot be read ({error.strerror})") from error
+
+    for folder, folders, names in os.walk(place, onerror=stop):
+        folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
+        there += [Path(folder, name) for name in names if not name.startswith(".")]
+    found = sorted(path for path in there if path.suffix.lower() in suffixes)
     if not found:
         raise MissingDataError(f"{place} holds no file of {' '.join(suffixes)}")
-    return sorted(found), place, others
-
-
-def _stop(error: OSError) -> None:
-    """Stop `os.walk`, which would leave out a folder that cannot be read."""
-    raise MissingDataError(f"{error.filename} cannot be read ({error.strerror})") from error
-
-
-def passed_over(others: Mapping[str, int]) -> str:
-    """How many files of which endings are not read."""
-    shown = (f"{n} {printable_name(end) or 'without ending'}" for end, n in others.items())
-    return f"passed over: {', '.join(shown)}"
+    return found, place, Counter(path.suffix for path in {*there} - {*found})
 
 
 def clouds(place: Path, up: str, part: str, classes: Sequence[str]) -> Inputs:
@@ -153,46 +154,32 @@ def clouds(place: Path, up: str, part: str, classes: Sequence[str]) -> Inputs:
     if (place / "manifest.csv").is_file():  # its other arrays are clouds, too
         place = place / "points.npy"
     files, root, others = find_files(place)
-    units = [
-        Unit(partial(_clouds, path, root, up, classes), partial(_clouds_in, path)) for path in files
-    ]
-    return Inputs(units, "file", [passed_over(others)] if others else [])
+    left = ", ".join(f"{n} {end or 'without ending'}" for end, n in others.items())
+    units = [partial(_clouds, path, root, up, classes) for path in files]
+    return Inputs(units, "file", [f"passed over: {left}"] if left else [])
 
 
-def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
-    name = printable_name(path.relative_to(root).as_posix())
+def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterator[Sample]:
+    name = printable(path.relative_to(root).as_posix())
     folders = [known_as(part, classes) for part in path.relative_to(root).parts[:-1]]
     folder = next((cls for cls in reversed(folders) if cls), "")
     try:
-        found = CloudFile((_on_surface(path),)) if is_mesh(path) else parse_clouds(path)
+        if is_mesh(path):  # its vertices alone lie at corners
+            mesh, rng = load_mesh(path), np.random.default_rng(0)
+            found = CloudFile((surface_sample(mesh.vertices, mesh.faces, _ON_MESH, rng),))
+        else:
+            found = parse_clouds(path)
     except DataError as error:
-        yield Row(name, None, None, reason_of(error, str(path)), None, folder)
+        yield Sample(name, label=folder).failed(error, str(path))
         return
     for i, given in enumerate(found.clouds):
         own = f"{name}[{i}]" if found.many else name
         label = _label(found.labels[i], classes) if found.labels is not None else folder
         try:
             cloud, dropped = with_depth(given, own)
+            yield Sample(own, cloud, dropped, axis, label, up=axis)
         except DataError as error:
-            yield Row(own, 0, len(given), reason_of(error, own), None, label)
-            continue
-        yield Sample(own, cloud, dropped, axis, label, up=axis)
-
-
-def _clouds_in(path: Path) -> int:
-    """How many clouds a file holds; 1 if it cannot be read."""
-    try:
-        if path.suffix.lower() == ".npy":
-            return npy_clouds(path) or 1
-        return len(parse_clouds(path).clouds) if path.suffix.lower() in _SEVERAL else 1
-    except DataError:
-        return 1
-
-
-def _on_surface(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Points on a mesh: its vertices alone lie at corners."""
-    mesh = load_mesh(path)
-    return surface_sample(mesh.vertices, mesh.faces, _ON_MESH, np.random.default_rng(0))
+            yield Sample(own, dropped=len(given), label=label, points=0).failed(error, own)
 
 
 def _archive(archive: Archive, part: str, classes: Sequence[str]) -> Inputs:
@@ -208,7 +195,7 @@ def _archive(archive: Archive, part: str, classes: Sequence[str]) -> Inputs:
         chosen, taken = np.flatnonzero(archive.dev != JUDGE).tolist(), f"all but part {JUDGE}"
     else:
         taken = "all objects"
-    units = [Unit(partial(_object, archive, i, classes), partial(int, 1)) for i in chosen]
+    units = [partial(_object, archive, i, classes) for i in chosen]
     counts = ", ".join(f"{name} {count}" for name, count in archive.parts.items())
     return Inputs(units, "object", [f"{taken} of {counts} (part=)"] if counts else [])
 
@@ -225,17 +212,18 @@ def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sa
         occ=0.0 if archive.occ is None else float(archive.occ[index]),
         extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
     )
-    tier = str(archive.tier[index])
-    cautions = [Caution(one.kind, one.words) for one in faults(piece, "", RULES)]
-    if tier == "hard" and not cautions:
-        cautions = [Caution("otherwise hard", "the archive calls it hard")]
+    tier, cautions = str(archive.tier[index]), []
+    if tier == "hard":
+        cautions = [Caution(one.kind, one.words) for one in faults(piece, "", RULES)]
+        cautions = cautions or [Caution("otherwise hard", "the archive calls it hard")]
     yield Sample(
         f"{archive.path.name}[{index}]",
         cloud,
         archive.size(index) - len(cloud),
         label=_label(str(archive.cls[index]), classes),
         tier=tier,
-        cautions=tuple(cautions) if tier == "hard" else (),
+        cautions=tuple(cautions),
+        up="z",
     )
 
 
@@ -267,86 +255,65 @@ def depth_images(
             raise ConfigError(f"depth={depth} is a folder: give mask=FOLDER, masks of its names")
         masks = {path.stem: path for path in mask.iterdir() if path.suffix.lower() in _IMAGES}
         pairs = {path: masks.get(path.stem) for path in find_files(depth, _IMAGES)[0]}
-    units = [
-        Unit(
-            partial(_pointed, path, own, box, camera, scale_m, way, gravity),
-            partial(_objects_in, own),
-        )
-        for path, own in pairs.items()
-    ]
-    return Inputs(units, "depth image")
+
+    def read(path: Path, own: Path | None) -> Iterator[Sample]:
+        name = printable(path.name)
+        try:
+            if (own is None) == (box is None):
+                raise DataError("a depth image takes a mask (of its name, in a folder) or a box")
+            image = read_depth(path, scale_m, camera.depth_scale)
+            numbers = None if own is None else read_mask(own)
+            yield from pointed(name, image, camera, numbers, box, way, gravity)
+        except Qs3Error as error:
+            yield Sample(name).failed(str(error).removeprefix(str(path)), name)
+
+    return Inputs([partial(read, path, own) for path, own in pairs.items()], "depth image")
 
 
-def _pointed(
-    path: Path,
-    mask: Path | None,
-    box: Sequence[float] | None,
+def pointed(
+    name: str,
+    depth_m: Float[np.ndarray, "h w"],
     given: Intrinsics,
-    scale_m: float | None,
+    mask: np.ndarray | None,
+    box: Sequence[float] | None,
     up: Sequence[float] | None,
     gravity: str,
-) -> Iterator[Sample | Row]:
-    name = printable_name(path.name)
-    try:
-        if (mask is None) == (box is None):
-            raise DataError("a depth image takes a mask (of its name, in a folder) or a box")
-        depth = read_depth(path, scale_m, given.depth_scale)
-        camera = check_intrinsics(given, depth, str(path))
-        numbers = None if mask is None else read_mask(mask)
-        found = point_out(depth, camera, mask=numbers, box=box, up=up)
-    except Qs3Error as error:
-        yield Row(name, None, None, reason_of(error, str(path)), None)
-        return
-    unsure = [Caution("camera", words)] if (words := off_centre(given, depth)) else []
+) -> Iterator[Sample]:
+    """The objects of a mask, one a number, or of a box; see `qs3.datasets.pointed.point_out`."""
+    found = point_out(
+        depth_m,
+        check_intrinsics(given, depth_m, name or "the depth image"),
+        mask=mask,
+        box=box,
+        up=up,
+    )
+    unsure = [Caution("camera", words)] if (words := off_centre(given, depth_m)) else []
     if given.bent:
         unsure.append(Caution("lens", "the camera's distortion is known and not corrected"))
     for one in found:
-        own = name + one.name
-        if one.why:
-            yield Row(own, 0, one.without_depth, one.why, None, tier=one.tier, up=one.up)
-            continue
-        yield Sample(
-            own,
+        sample = Sample(
+            name + one.name,
             one.cloud(gravity),
             one.without_depth,
             tier=one.tier,
             cautions=(*one.cautions, *unsure),
             up=one.up,
-            picture=(depth, one.mask),
+            picture=around(depth_m, one.mask),
             world_from_camera=one.world_from_camera if gravity == "none" else None,
         )
+        yield sample.failed(one.why) if one.why else sample
 
 
-def _objects_in(mask: Path | None) -> int:
-    """How many objects a mask marks; 1 if it cannot be read, and in a box."""
-    try:
-        return int((np.unique(read_mask(mask)) != 0).sum()) if mask else 1
-    except Qs3Error:
-        return 1
-
-
-def drawn(units: Sequence[Unit], count: int) -> list[Unit]:
-    """The same with `count` of their objects, drawn at random, always the same."""
-    sizes = [unit.size() for unit in units]
-    ends = np.cumsum(sizes)
-    chosen = np.random.default_rng(0).choice(ends[-1], min(count, ends[-1]), replace=False)
-    kept = []
-    for unit, size, end in zip(units, sizes, ends, strict=True):
-        wanted = {int(i - (end - size)) for i in chosen if end - size <= i < end}
-        if wanted:
-            kept.append(Unit(partial(_some, unit, wanted, size), partial(len, wanted)))
-    return kept
-
-
-def _some(unit: Unit, wanted: set[int], size: int) -> Iterator[Sample | Row]:
-    found = list(unit.read())
-    damaged = len(found) != size
-    yield from (one for i, one in enumerate(found) if damaged or i in wanted)
-
-
-def reason_of(error: Qs3Error, name: str) -> str:
-    """What is wrong, without the name before it: that has a column of its own."""
-    return printable(str(error).removeprefix(name).lstrip(" :,"))
+def around(
+    depth_m: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Of both the part that is shown, copied: a frame need not be kept for one object."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    side = max(np.ptp(rows), np.ptp(columns)) + 1
+    half = int(side * (0.5 + _MARGIN)) + 4
+    v, u = (int(rows[0] + rows[-1]) // 2, int(columns[0] + columns[-1]) // 2)
+    at = slice(max(v - half, 0), v + half), slice(max(u - half, 0), u + half)
+    return depth_m[at].copy(), mask[at].copy()
 
 
 def _label(given: object, classes: Sequence[str]) -> str:
@@ -355,8 +322,3 @@ def _label(given: object, classes: Sequence[str]) -> str:
         return classes[given] if 0 <= given < len(classes) else str(given)
     words = given.decode(errors="replace") if isinstance(given, bytes) else str(given)
     return known_as(words, classes) or printable(words)
-
-
-def printable_name(name: str) -> str:
-    """A file's name for tables, pages and terminals: what is not UTF-8 or printable is escaped."""
-    return printable(name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"))

@@ -6,8 +6,7 @@
       config.json         the rest of it, as plain values by name, and the weights' SHA-256
       README.md           a card for people, with the metadata that hubs read at its top
 
-`config.json` has the form that huggingface_hub's `PyTorchModelHubMixin` passes to a class; such a
-folder can be uploaded as it is (`upload_folder`). A file that somebody else made is not trusted: it
+`config.json` has the form that huggingface_hub's `PyTorchModelHubMixin` passes to a class. A file
 is read without unpickling objects, weights with another hash are refused, and the net it asks for
 must be one of `qs3.models`. Classifiers that come with qs3 are such folders, found by their names;
 none has seen a real scan.
@@ -148,12 +147,7 @@ def write_folder(folder: Path, result: Result, card: str) -> None:
 
 
 def find_result(path: str | Path) -> Path:
-    """The file meant by a name, by the folder of a run or of an exported model, or by a file.
-
-    Raises:
-        MissingDataError: there is none.
-        ConfigError: a net that `qs3 export` wrote as one file.
-    """
+    """The file meant by a name, by the folder of a run or of an exported model, or by a file."""
     if str(path) in pretrained_names() and not Path(path).exists():
         path = PRETRAINED / path
     path = Path(path).expanduser()
@@ -169,12 +163,7 @@ def find_result(path: str | Path) -> Path:
 
 
 def read_result(path: str | Path) -> Result:
-    """Read and check what `write_result` or `write_folder` wrote; nothing in it is run.
-
-    Raises:
-        MissingDataError: no such file.
-        DataError: damaged, or not a result.
-    """
+    """Read and check what `write_result` or `write_folder` wrote; nothing in it is run."""
     file = find_result(path)
     if file.name != WEIGHTS:
         return _checked(file, load(file, advice="copy it again, or repeat its run"))
@@ -198,9 +187,6 @@ def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
     """The net in eval mode, with its weights, on the CPU; the file need not be trusted.
 
     `packages`: where the net may be defined. Your own net: `("qs3.models", "my_package")`.
-
-    Raises:
-        DataError: a net from elsewhere, or weights that are not this net's.
     """
     arguments = dict(result.model)
     target = str(arguments.pop("_target_", ""))
@@ -221,16 +207,16 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
     """The class or function, if it is defined in one of the packages (or modules) itself."""
     packages = (packages,) if isinstance(packages, str) else packages
     module, _, name = target.rpartition(".")
-    make = None
+    make, why = None, f"it is not defined in {' or '.join(packages)}"
     if any(f"{module}.".startswith(f"{package}.") for package in packages):
         try:
             make = getattr(importlib.import_module(module), name, None)
         except ImportError as error:
-            raise DataError(f"the file's model {target} cannot be imported: {error}") from error
+            why = str(error)
     if not callable(make) or getattr(make, "__module__", None) != module:
         raise DataError(
-            f"the file's model {target} is refused: it is not defined in {' or '.join(packages)}; "
-            "name the package of a net of your own, packages="
+            f"the file's model {target} is refused: {why}; name the package of a net of your own, "
+            "packages="
         )
     return make
 

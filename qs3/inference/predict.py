@@ -15,15 +15,16 @@ from qs3.datasets.pointed import LEVEL, PLANES
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.expected import expected_accuracy
 from qs3.evaluation.ood import other_units
-from qs3.inference.inputs import Sample, Unit, reason_of
+from qs3.inference.inputs import Sample
 from qs3.inference.model_file import find_result
-from qs3.inference.predictor import DIVERGED, Predictor, Prepared, load
-from qs3.inference.scores import Count, disputed, right, scores
-from qs3.inference.table import Row
+from qs3.inference.predictor import Predictor, load
+from qs3.inference.table import Count, disputed, right, scores
 from qs3.kernels.norms import use_trained
 from qs3.runs.metrics import read_metrics
 
 _SHOWN = 10  # failures in the text for the terminal
+
+Unit = Callable[[], Iterator[Sample]]
 
 
 def predict_units(
@@ -34,15 +35,15 @@ def predict_units(
     batch_size: int = 16,
     threads: int = 1,
     advance: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[Row, Sample | None]]:
-    """A row for each cloud, in order, and what it was made of; `advance` is called after a unit.
+) -> Iterator[Sample]:
+    """The objects of all units, in order, predicted; `advance` is called after a unit.
 
     Each thread has a batch of its own: the work between products of matrices does not gain from
     several threads in one batch. A few batches are in memory.
     """
     threads_before = torch.get_num_threads()
     pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
-    running: deque[Future[list[tuple[Row, Sample | None]]]] = deque()
+    running: deque[Future[list[Sample]]] = deque()
     try:
         # Once for all: threads that change and restore a net's domain would do it to one another.
         with contextlib.ExitStack() as using:
@@ -61,11 +62,10 @@ def predict_units(
 
 def _batches(
     units: Iterable[Unit], size: int, advance: Callable[[], None]
-) -> Iterator[list[Row | Sample]]:
-    """The clouds of all units, `size` at a time; what cannot be read is a row already."""
-    batch: list[Row | Sample] = []
+) -> Iterator[list[Sample]]:
+    batch: list[Sample] = []
     for unit in units:
-        for item in unit.read():
+        for item in unit():
             batch.append(item)
             if len(batch) == size:
                 yield batch
@@ -76,36 +76,16 @@ def _batches(
 
 
 def _predicted(
-    predictor: Predictor,
-    second: Predictor | None,
-    batch: Sequence[Row | Sample],
-    floor: float | None,
-) -> list[tuple[Row, Sample | None]]:
-    """The rows of a batch: each cloud prepared, and one pass of each net."""
-    rows: list[tuple[Row, Sample | None]] = []
-    ready: list[tuple[int, Sample, Prepared]] = []
-    for i, item in enumerate(batch):
-        if isinstance(item, Row):
-            rows.append((item, None))
-            continue
-        try:
-            ready.append((i, item, predictor.prepare(item.cloud, item.name, item.axis, floor)))
-            rows.append((item.row("", None), None))
-        except DataError as error:
-            rows.append((item.row(reason_of(error, item.name), None), None))
-    if not ready:
-        return rows
-    points = torch.stack([each.points for _, _, each in ready])
-    plain = predictor.without_prior(points, len(points))
-    found = predictor.prior(plain) if predictor.prior else plain
-    others = _second_classes(second, [item for _, item, _ in ready], floor)
-    for (i, item, each), probabilities, raw, other in zip(ready, found, plain, others, strict=True):
-        if np.isnan(raw).any():
-            rows[i] = item.row(DIVERGED, None), None
-        else:
-            row = item.row("; ".join(each.strange), probabilities)
-            rows[i] = row._replace(second=other, without_prior=raw), item
-    return rows
+    predictor: Predictor, second: Predictor | None, batch: list[Sample], floor: float | None
+) -> list[Sample]:
+    predictor.predict(batch, floor)
+    good = [one for one in batch if one.cls]
+    if second and good:
+        ready = [second.prepare(one.cloud, one.name, one.axis, floor).points for one in good]
+        found = second.probabilities(torch.stack(ready), len(ready))
+        for one, each in zip(good, found, strict=True):
+            one.second = "" if np.isnan(each).any() else second.classes[int(each.argmax())]
+    return batch
 
 
 def second_opinion(name: str, first: Predictor, floor: float | None, **how: Any) -> Predictor:
@@ -118,34 +98,9 @@ def second_opinion(name: str, first: Predictor, floor: float | None, **how: Any)
     return second
 
 
-def _second_classes(
-    second: Predictor | None, items: Sequence[Sample], floor: float | None
-) -> list[str]:
-    """The classes that a second classifier names; "" without one, or if it has diverged."""
-    if second is None:
-        return [""] * len(items)
-    clouds = [second.prepare(item.cloud, item.name, item.axis, floor).points for item in items]
-    found = second.probabilities(torch.stack(clouds), len(clouds))
-    return ["" if np.isnan(one).any() else second.classes[int(one.argmax())] for one in found]
-
-
-def agreement(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
-    """How often a second classifier agrees, and, with labels, what that was worth."""
-    asked = [row for row in rows if row.second]
-    if not asked:
-        return []
-    parts = []
-    for words, differs in (("agrees on", False), ("differs on", True)):
-        some = [row for row in asked if disputed(row, classes) is differs]
-        judged = [r for row in some if (r := right(row, classes)) is not None]
-        share = f" ({sum(judged) / len(judged):.0%} right)" if judged else ""
-        parts.append(f"{words} {len(some)}{share}")
-    return [f"a second classifier {', '.join(parts)} (column second); inspect disagreements"]
-
-
-def expected(rows: Sequence[Row], predictor: Predictor) -> float | None:
+def expected(samples: Sequence[Sample], predictor: Predictor) -> float | None:
     """The share of answers that is expected to be right, without a look at labels."""
-    plain = [row.without_prior for row in rows if row.without_prior is not None]
+    plain = [one.without_prior for one in samples if one.without_prior is not None]
     return expected_accuracy(predictor.result.held_out, np.array(plain)) if plain else None
 
 
@@ -160,48 +115,47 @@ def trained_on(name: str) -> str:
 
 def notes(predictor: Predictor, kind: str, floor_known: bool) -> list[str]:
     """What is taken for granted about the clouds, for terminal and page."""
-    result = predictor.result
     found = [predictor.prior.words] if predictor.prior else []
     if predictor.in_metres and kind == "file":
         found.append("the classifier knows sizes: coordinates count as metres")
     if predictor.needs_floor and not floor_known:
         height = predictor.camera_height
         found.append(f"the camera counts as {height:g} m above the floor (camera_height=)")
-    if result.gravity == "none" and kind != "depth image":
+    if predictor.result.gravity == "none" and kind != "depth image":
         found.append("the classifier knows clouds in the frame of their camera, not z up")
     return found
 
 
-def summary(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
+def summary(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
     """What was predicted, for the terminal."""
-    good = [row for row in rows if row.probabilities is not None]
-    failed = [row for row in rows if row.probabilities is None]
+    good = [one for one in samples if one.cls]
+    failed = [one for one in samples if not one.cls]
     lines = []
     if good:
-        counts = Counter(classes[int(np.argmax(row.probabilities))] for row in good)  # type: ignore[arg-type]
+        counts = Counter(one.cls for one in good)
         lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
-        lines += _scored(rows, classes)
-        strange, odd = sum(bool(row.reason) for row in good), sum(bool(r.cautions) for r in good)
+        lines += _scored(samples, classes)
+        strange, odd = sum(bool(one.reason) for one in good), sum(bool(o.cautions) for o in good)
         lines.append(f"{strange} out of range (column out_of_range), {odd} with a caution")
-        lines += filter(None, [other_units(row.reason for row in good)])
-    ups = Counter(row.up for row in rows)
+        lines += filter(None, [other_units(one.reason for one in good)])
+    ups = Counter(one.up for one in samples)
     if ups[PLANES] or ups[LEVEL]:
         lines.append(
             f"up was fitted to the planes of the picture for {ups[PLANES]}, and taken from a level "
             f"camera for {ups[LEVEL]} (up=)"
         )
-    if dropped := sum(row.dropped or 0 for row in good):
+    if dropped := sum(one.dropped or 0 for one in good):
         lines.append(f"{dropped} points left out, without depth or stray (column dropped)")
     if failed:
         lines.append(f"{len(failed)} failed:")
-        lines += [f"  {row.file}: {row.reason}" for row in failed[:_SHOWN]]
+        lines += [f"  {one.name}: {one.reason}" for one in failed[:_SHOWN]]
         lines += [f"  and {len(failed) - _SHOWN} more, see the table"] * (len(failed) > _SHOWN)
-    return lines
+    return lines + _agreement(good, classes)
 
 
-def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
+def _scored(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
     """Right and wrong, if there are labels."""
-    found = scores(rows, classes)
+    found = scores(samples, classes)
     if found is None:
         return []
 
@@ -216,3 +170,16 @@ def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
         f"{line}; always {label}: {times / found.all.of:.1%}",
         *([f"labels that are not classes, left out: {others}"] if others else []),
     ]
+
+
+def _agreement(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
+    """How often a second classifier agrees, and, with labels, what that was worth."""
+    asked = [one for one in samples if one.second]
+    parts = []
+    for words, differs in (("agrees on", False), ("differs on", True)):
+        some = [one for one in asked if disputed(one) is differs]
+        judged = [r for one in some if (r := right(one, classes)) is not None]
+        share = f" ({sum(judged) / len(judged):.0%} right)" if judged else ""
+        parts.append(f"{words} {len(some)}{share}")
+    line = f"a second classifier {', '.join(parts)} (column second); inspect disagreements"
+    return [line] if asked else []

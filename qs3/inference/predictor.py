@@ -5,8 +5,6 @@
     objects = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
     predictor = qs3.load("dgcnn-rooms")  # in_metres, and needs_floor
     probabilities = predictor([cloud_a, cloud_b], floor=0.0)  # z of the floor, in metres
-    objects = predictor.predict_depth(depth_m, camera, mask=mask, camera_height=1.2)
-    predictor = qs3.load(run, prior="rooms")  # or prior={"chair": 4, "bathtub": 0}
 
 A cloud goes the way of the target's clouds in the run: it is brought to as many points as these
 were stored with (`resample`); put into the unit ball, or of a net that sees metres only centred, or
@@ -31,22 +29,15 @@ from torch import Tensor, nn
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
 from qs3.datasets.clouds import check_shape, checked
-from qs3.datasets.depth_images import (
-    Intrinsics,
-    Pinhole,
-    camera_of,
-    check_intrinsics,
-    check_metres,
-    off_centre,
-)
+from qs3.datasets.depth_images import Intrinsics, Pinhole, camera_of, check_metres
 from qs3.datasets.importing import check_cloud, thinned, turned
-from qs3.datasets.pointed import Pointed, point_out
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, other_units, relax_min_points
 from qs3.evaluation.prior import POWER, Prior, read_prior
+from qs3.inference.inputs import Sample, pointed
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
-from qs3.utils.allocator import keep_freed_memory
+from qs3.utils.processor import keep_freed_memory
 
 log = logging.getLogger(__name__)
 
@@ -67,34 +58,6 @@ class Prepared(NamedTuple):
 
     points: Float[Tensor, "m 3"]
     strange: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class DepthPrediction:
-    """A classifier's prediction for one object of a depth image.
-
-    Attributes:
-        name: "[3]", the number in the mask; "[210,95,480,430]", the box; "" of a mask of bool.
-        cls: the likeliest class; "" if nothing of the object was measured, or the classifier's
-            training has diverged.
-        confidence: its probability, in [0, 1]; NaN if there is no class.
-        probabilities: [C] float64, in the order of the predictor's classes; likewise.
-        points_m: [n, 3] float32, z up, the camera at the origin.
-        tier: "clean", "hard", or "poor": datasets leave such objects out.
-        cautions: the reasons for `tier`, and what is not sure about the picture.
-        up: how the vertical is known: "given", "planes" of the picture, or "level" camera.
-        strange: how the cloud differs from all of training's; see `qs3.evaluation.ood`.
-    """
-
-    name: str
-    cls: str
-    confidence: float
-    probabilities: Float[np.ndarray, " c"]
-    points_m: Float[np.ndarray, "n 3"]
-    tier: str
-    cautions: tuple[str, ...]
-    up: str
-    strange: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,11 +111,7 @@ class Predictor:
         return -floor if floor is not None and floor < 0 else None
 
     def prepare(
-        self,
-        cloud: np.ndarray,
-        name: str = "the cloud",
-        up: str = "z",
-        floor: float | None = None,
+        self, cloud: Any, name: str = "the cloud", up: str = "z", floor: float | None = None
     ) -> Prepared:
         """A cloud [n, >= 3] of any n >= 1 as the net sees it.
 
@@ -177,11 +136,7 @@ class Predictor:
         return Prepared(one.points[0], tuple(ood_reasons(measure_one(one, 0), usual)))
 
     def floor(self, given: float | None) -> float:
-        """Where the floor is in clouds: as given, else as in the target.
-
-        Raises:
-            ConfigError: it is needed and not known, or is not in metres.
-        """
+        """Where the floor is in clouds: as given, else as in the target; ConfigError as above."""
         if given is None and self.needs_floor and self.camera_height is None:
             raise ConfigError(
                 "the classifier knows heights above the floor: give floor=Z, 0 if objects stand on "
@@ -196,14 +151,8 @@ class Predictor:
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
     ) -> Float[np.ndarray, "n c"]:
         """Class probabilities of prepared clouds, with `prior`; n >= 1."""
-        found = self.without_prior(points, batch_size)
+        found = predict(self.net, points, batch_size, self.device)
         return self.prior(found) if self.prior else found
-
-    def without_prior(
-        self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
-    ) -> Float[np.ndarray, "n c"]:
-        """The same as the net gives them."""
-        return predict(self.net, points, batch_size, self.device)
 
     def __call__(
         self,
@@ -219,17 +168,14 @@ class Predictor:
         Warns of clouds that are too large for the net's metres.
 
         Args:
-            clouds: [N, P, 3], or a list of clouds with different numbers of points; their unit as
-                in `prepare`.
+            clouds: [N, P, 3], or a list of clouds with different numbers of points.
             names: theirs, for messages; None counts them from 0.
-            up: the axis that points up in them.
-            floor: where the floor is in them, in metres, as in `prepare`: 0 if objects stand on
-                z = 0. "dgcnn-rooms" needs it.
+            up, floor: as in `prepare`, of all of them. "dgcnn-rooms" needs the floor.
             batch_size: clouds that the net sees at a time.
 
         Raises:
             DataError: names the cloud that is empty or not finite.
-            ConfigError: `floor` is needed, as `prepare` says.
+            ConfigError: `floor` is needed.
         """
         if getattr(clouds, "ndim", 3) == 2:
             raise DataError("got one cloud; give a list of them, predictor([cloud])")
@@ -243,6 +189,36 @@ class Predictor:
             log.warning("of %d clouds %s", len(ready), words)
         return self.probabilities(torch.stack([one.points for one in ready]), batch_size)
 
+    def predict(self, samples: Sequence[Sample], floor: float | None = None) -> None:
+        """Fill in what the net makes of samples, in one batch; those that failed stay as they are.
+
+        Args:
+            samples: with clouds; one that cannot be used becomes one that failed.
+            floor: where the floor is in them, in metres, as in `prepare`.
+        """
+        ready: list[tuple[Sample, Tensor]] = []
+        for one in samples:
+            if one.cloud is None:
+                continue
+            try:
+                points, strange = self.prepare(one.cloud, one.name, one.axis, floor)
+            except DataError as error:
+                one.failed(error, one.name)
+                continue
+            one.reason = "; ".join(strange)
+            ready.append((one, points))
+        if not ready:
+            return
+        stacked = torch.stack([points for _, points in ready])
+        plain = predict(self.net, stacked, len(ready), self.device)
+        found = self.prior(plain) if self.prior else plain
+        for (one, _), raw, each in zip(ready, plain, found, strict=True):
+            if np.isnan(raw).any():
+                one.failed(DIVERGED)
+                continue
+            one.without_prior, one.probabilities = raw, each
+            one.cls = self.classes[int(each.argmax())]
+
     def predict_depth(
         self,
         depth_m: Float[np.ndarray, "h w"],
@@ -252,7 +228,7 @@ class Predictor:
         box: Sequence[float] | None = None,
         up: Sequence[float] | None = None,
         camera_height: float | None = None,
-    ) -> list[DepthPrediction]:
+    ) -> list[Sample]:
         """The classes of the objects of a mask, one a number, or of what lies in a box.
 
         Args:
@@ -268,7 +244,7 @@ class Predictor:
                 their target, if that is a camera's.
 
         Returns:
-            In the order of the mask's numbers.
+            In the order of the mask's numbers: `cls`, `confidence`, `cautions`, `upright`, ...
 
         Raises:
             DataError: not a depth image, a mask of another size, a box outside of the picture, or
@@ -280,37 +256,11 @@ class Predictor:
         if not isinstance(camera, Pinhole):
             camera = camera_of([float(value) for value in np.ravel(camera)], "camera")
         check_metres(depth, "the depth image")
-        check_intrinsics(given := Intrinsics(camera), depth, "the depth image")
-        unsure = [words] if (words := off_centre(given, depth)) else []
         mask = None if mask is None else _filled(mask)
-        found = point_out(depth, camera, mask=mask, box=box, up=up)
-        return [self._of_depth(one, unsure, floor) for one in found]
-
-    def _of_depth(self, one: Pointed, unsure: Sequence[str], floor: float) -> DepthPrediction:
-        strange: tuple[str, ...] = ()
-        cautions = [*(caution.words for caution in one.cautions), *unsure]
-        cls, each = "", np.full(len(self.classes), np.nan)
-        if one.why:
-            cautions.append(one.why)
-        else:
-            ready = self.prepare(one.cloud(self.result.gravity), one.name, floor=floor)
-            (each,), strange = self.probabilities(ready.points[None]), ready.strange
-            if np.isnan(each).any():
-                cautions.append(DIVERGED)
-                each = np.full(len(self.classes), np.nan)
-            else:
-                cls = self.classes[int(each.argmax())]
-        return DepthPrediction(
-            name=one.name,
-            cls=cls,
-            confidence=float(each.max()),
-            probabilities=each,
-            points_m=one.piece.points_m,
-            tier=one.tier,
-            cautions=tuple(cautions),
-            up=one.up,
-            strange=strange,
-        )
+        given = Intrinsics(camera)
+        found = list(pointed("", depth, given, mask, box, up, self.result.gravity))
+        self.predict(found, floor)
+        return found
 
 
 def load(
@@ -321,10 +271,35 @@ def load(
     prior: str | Mapping[str, float] | None = None,
     prior_power: float = POWER,
 ) -> Predictor:
-    """The classifier that a finished run reports; see `qs3.load`.
+    """The classifier that a finished run reports.
 
-    On the CPU the process keeps the memory that predictions free from then on, as trainings do
-    (`qs3.utils.allocator`): it stays as large as it was at most, and predictions are faster.
+        predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
+        probabilities = predictor([cloud_a, cloud_b])  # [2, classes] float64
+        predictor.classes  # their names, in that order
+        found = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
+
+    A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`). One that
+    knows sizes and heights, as "dgcnn-rooms" (`predictor.needs_floor`), takes metres and needs the
+    floor: `predictor(clouds, floor=0.0)`, `predictor.predict_depth(..., camera_height=1.2)`.
+
+    On the CPU the process keeps the memory that predictions free from then on
+    (`qs3.utils.processor.keep_freed_memory`): it stays as large as it was at most.
+
+    Args:
+        run: its folder, or the file result.pt of it, which needs nothing next to it; or a folder
+            that `qs3 export out=FOLDER` wrote; or the name of a classifier that comes with qs3,
+            "dgcnn-speckle".
+        device: where to run it: "cpu", "cuda", "cuda:1".
+        packages: where the net of the file may be defined. For a net of your own add your
+            package, if you trust it to be built with any arguments.
+        prior: how common classes are where the clouds come from: "rooms", as in ScanNet's, or
+            {"chair": 4, "bathtub": 0}, where those not named count as 1; None: as in training.
+        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.evaluation.prior`).
+
+    Raises:
+        MissingDataError: no finished run there.
+        DataError: the file is damaged, or asks for something else than a net of `packages`.
+        ConfigError: no such prior.
     """
     result = read_result(run)
     place = torch.device(device)
@@ -340,15 +315,10 @@ def load(
 def resample(
     cloud: Float[np.ndarray, "n 3"], points: int, up: str = "z"
 ) -> Float[np.ndarray, "points 3"]:
-    """A cloud as the store has it: float32 [points, 3] with z up.
+    """A cloud as the store has it: float32 [points, 3] with z up, of one with the axis `up` up.
 
     Of more points the farthest from the first one on are kept; fewer are repeated from the first
     one on.
-
-    Args:
-        cloud: n >= 1.
-        points: how many it gets.
-        up: the axis that points up in it: x, y, z, -x, -y or -z.
     """
     found = turned(check_cloud(thinned(cloud, points), points, "the cloud"), up)
     return np.ascontiguousarray(found)  # as on disk: sums take another order otherwise

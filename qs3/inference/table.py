@@ -1,96 +1,131 @@
-"""The table of `qs3 predict`, a row for each object, as CSV and as JSON."""
+"""The table of `qs3 predict`, a row for each object, and how many are right by their labels."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Int
 
-from qs3.datasets.pointed import Caution
+from qs3.inference.inputs import Sample
 from qs3.utils.text_table import csv_text
-from qs3.utils.version import VERSION
 
 COLUMNS = (
     *("file", "status", "class", "confidence", "second", "label", "points", "dropped", "tier"),
     *("caution", "up", "out_of_range", "reason"),
 )
+STRANGE = "unlike training"
+"""The kind of what is out of the range of training's clouds."""
+
+DISPUTED = "another classifier disagrees"
+"""The kind of what a second classifier calls otherwise."""
 
 
-class Row(NamedTuple):
-    """The prediction for one cloud, or why there is none.
-
-    Attributes:
-        file: relative to the input; name[3] is cloud 3 of a file that holds several, or object 3
-            of a depth image's mask.
-        points: that were used; None if it could not be read.
-        dropped: points that were left out: without depth or marked as stray; of a depth image the
-            object's pixels without depth. None if it could not be read.
-        reason: in what it is out of range, or why it failed; "" otherwise.
-        probabilities: [C] float64; None if it failed.
-        label: what it is, if that is known: a class of the net's, or another word; "" if not.
-        tier: of an object cut from a depth image: "clean", "hard" or "poor"; "" of other clouds.
-        cautions: what was wrong when it was cut.
-        up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
-        second: the class that another classifier names; "" without one.
-        without_prior: as `probabilities`, with classes as common as in training.
-    """
-
-    file: str
-    points: int | None
-    dropped: int | None
-    reason: str
-    probabilities: Float[np.ndarray, " c"] | None
-    label: str = ""
-    tier: str = ""
-    cautions: tuple[Caution, ...] = ()
-    up: str = ""
-    second: str = ""
-    without_prior: Float[np.ndarray, " c"] | None = None
-
-
-def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
-    """A cloud's values in both formats, by `COLUMNS`, and "probabilities"; None where empty."""
-    found: dict[str, Any] = {
-        **dict.fromkeys(COLUMNS),
-        "file": row.file,
-        "status": "failed",
-        "label": row.label or None,
-        "points": row.points,
-        "dropped": row.dropped,
-        "tier": row.tier or None,
-        "caution": "; ".join(caution.words for caution in row.cautions) or None,
-        "up": row.up or None,
-        "reason": row.reason,
-        "probabilities": None,
-    }
-    if row.probabilities is not None:
-        best, each = int(row.probabilities.argmax()), row.probabilities.tolist()
-        found |= {
-            "status": "ok",
-            "class": classes[best],
-            "confidence": each[best],
-            "second": row.second or None,
-            "out_of_range": bool(row.reason),
-            "probabilities": dict(zip(classes, each, strict=True)),
-        }
-    return found
-
-
-def as_csv(rows: Sequence[Row], classes: Sequence[str]) -> str:
+def as_csv(samples: Sequence[Sample], classes: Sequence[str]) -> str:
     """A line each, with a column for each class."""
     lines: list[list[Any]] = [[*COLUMNS, *(f"p_{name}" for name in classes)]]
-    for cells in (record(row, classes) for row in rows):
-        cells["out_of_range"] = {True: "yes", False: "no", None: None}[cells["out_of_range"]]
-        each = cells["probabilities"] or dict.fromkeys(classes)
-        lines.append([*(cells[key] for key in COLUMNS), *each.values()])
+    for one in samples:
+        status, sure, strange, each = "failed", None, "", [None] * len(classes)
+        if one.probabilities is not None:
+            status, sure, each = "ok", one.confidence, one.probabilities.tolist()
+            strange = "yes" if one.reason else "no"
+        cautions = "; ".join(caution.words for caution in one.cautions)
+        row = [one.name, status, one.cls, sure, one.second, one.label, one.points, one.dropped]
+        lines.append([*row, one.tier, cautions, one.up, strange, one.reason, *each])
     return csv_text(lines)
 
 
-def as_json(rows: Sequence[Row], classes: Sequence[str], **about: Any) -> str:
-    """One document; `about` are further values at its top."""
-    clouds = [record(row, classes) for row in rows]
-    document = {"qs3": VERSION, "classes": list(classes), **about, "clouds": clouds}
-    return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+def right(one: Sample, classes: Sequence[str]) -> bool | None:
+    """Whether the net is right; None if there is no prediction, or no label of its classes."""
+    return one.cls == one.label if one.cls and one.label in classes else None
+
+
+def disputed(one: Sample) -> bool:
+    """Whether a second classifier was asked, and names another class."""
+    return bool(one.cls and one.second) and one.cls != one.second
+
+
+def kinds(one: Sample) -> list[str]:
+    """What was wrong with a cloud, or with what is said of it, in a few words each."""
+    strange = [STRANGE] * bool(one.cls and one.reason)
+    return [*(caution.kind for caution in one.cautions), *strange, *[DISPUTED] * disputed(one)]
+
+
+class Count(NamedTuple):
+    """So many right of so many."""
+
+    right: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """In [0, 1]; 0 of none."""
+        return self.right / max(self.of, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores of the samples with a prediction and a label that is one of the net's classes.
+
+    Attributes:
+        all: right ones.
+        balanced: mean over the classes that are there of the share that is right, in [0, 1].
+        majority: the commonest label, and how many have it.
+        confidence: mean over all of them, in [0, 1].
+        tiers: right ones of each tier, if there are any.
+        kinds: by what was wrong with a cloud: right ones with it, and without it.
+        confusion: [C, C] how often each label (row) was called each class (column).
+        unknown: labels that are not among the net's classes, and how often.
+        unlabelled: samples with a prediction and no label.
+    """
+
+    all: Count
+    balanced: float
+    majority: tuple[str, int]
+    confidence: float
+    tiers: dict[str, Count]
+    kinds: dict[str, tuple[Count, Count]]
+    confusion: Int[np.ndarray, "c c"]
+    unknown: dict[str, int]
+    unlabelled: int
+
+
+def scores(samples: Sequence[Sample], classes: Sequence[str]) -> Scores | None:
+    """The figures; None if no sample has both a prediction and a label of the net's classes."""
+    said = [one for one in samples if one.cls]
+    judged = [one for one in said if one.label in classes]
+    if not judged:
+        return None
+
+    def count(some: Iterable[Sample]) -> Count:
+        values = [one.cls == one.label for one in some]
+        return Count(sum(values), len(values))
+
+    confusion = np.zeros((len(classes), len(classes)), dtype=np.int64)
+    for one in judged:
+        confusion[classes.index(one.label), classes.index(one.cls)] += 1
+    totals = confusion.sum(axis=1)
+    every = Counter(kind for one in judged for kind in {*kinds(one)})
+    return Scores(
+        count(judged),
+        float((confusion.diagonal()[totals > 0] / totals[totals > 0]).mean()),
+        Counter(one.label for one in judged).most_common(1)[0],
+        float(np.mean([one.confidence for one in judged])),
+        {
+            tier: count(one for one in judged if one.tier == tier)
+            for tier in sorted({one.tier for one in judged} - {""})
+        },
+        {
+            kind: (
+                count(one for one in judged if kind in kinds(one)),
+                count(one for one in judged if kind not in kinds(one)),
+            )
+            for kind, _ in every.most_common()
+        },
+        confusion,
+        dict(Counter(one.label for one in said if one.label and one.label not in classes)),
+        sum(not one.label for one in said),
+    )

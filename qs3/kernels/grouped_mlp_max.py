@@ -354,8 +354,8 @@ class _Sums:
 def _parts(groups: int, values: int) -> list[slice]:
     """Groups in parts of about `_AT_ONCE` values, `values` a group, and larger of several threads.
 
-    Each operation on a part wakes them, and they sleep where they wait (`qs3.utils.threads`): with
-    two threads and one thread's parts a step took 1.7 times as long as with one thread.
+    Each operation on a part wakes them, and they sleep where they wait (`qs3.utils.processor`):
+    with two threads and one thread's parts a step took 1.7 times as long as with one thread.
     """
     threads = torch.get_num_threads()
     step = max(1, _AT_ONCE * (4 * threads if threads > 1 else 1) // values)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.utils.jit import compiled
+from qs3.utils.processor import compiled
 
 
 @compiled

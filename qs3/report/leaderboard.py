@@ -12,10 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from qs3.config.compose import composed
+from qs3.config.compose import composed, override
 from qs3.config.hashing import file_sha256
 from qs3.config.hydra import build
-from qs3.config.quoting import override
 from qs3.errors import ConfigError
 from qs3.methods.own import try_step
 from qs3.report.tables.comparison import against

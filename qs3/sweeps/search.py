@@ -35,14 +35,14 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config import hashing
+from qs3.config.compose import quoted
 from qs3.config.location import typed
-from qs3.config.quoting import quoted
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.listed_jobs import ListedJobs, OverLauncher
 from qs3.sweeps.ray_launcher import RayLauncher
 from qs3.training.provenance import check_finished
-from qs3.utils.locks import alone
+from qs3.utils.locks import locked
 from qs3.utils.text_table import aligned
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class LabelFreeSearch(OverLauncher):
         space = {key: distribution(one) for key, one in searched.items()}
         study = self._study(cfg, space)
         lock = self.file.with_name(f".{self.file.stem}.lock")
-        with alone(lock, f"another process is searching in {self.file}"):
+        with locked(lock, f"another process is searching in {self.file}"):
             # A trial without an end was interrupted: the lock says that nobody runs it now.
             self._refuse_changed(study, fixed)
             _try_again(study)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.config.quoting import override
+from qs3.config.compose import override
 from qs3.store.meta import MadeOf
 from qs3.store.store import ManifestRow, PointSet, write_pointset
 

@@ -23,7 +23,7 @@ from qs3.training.load import Loaded
 from qs3.training.provenance import changed
 from qs3.training.run import Run
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
-from qs3.utils.processor_time import Moment
+from qs3.utils.processor import Moment
 
 _OURS = ("threads", "gpus", "cuda_graphs", "float32_matmul")
 

@@ -30,9 +30,7 @@ from qs3.training.provenance import warn_of_changes
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
-from qs3.utils.allocator import keep_freed_memory
-from qs3.utils.processor_time import Moment, processor_seconds
-from qs3.utils.threads import cores, number_of
+from qs3.utils.processor import Moment, cores, keep_freed_memory, number_of, processor_seconds
 
 log = logging.getLogger(__name__)
 

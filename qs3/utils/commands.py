@@ -6,13 +6,7 @@
         points: Annotated[int, Ge(1), "points of each cloud"] = 1024,
         **overrides: Annotated[str, "settings of the domain's config"],
     ) -> None:
-        \"\"\"Draw clouds at random.
-
-        Paragraphs of the docstring stand below the options.
-
-Example:
-            qs3 sample scans points=512
-        \"\"\"
+        \"\"\"Draw clouds at random.\"\"\"
 
 Parameters before the `*` also take words without "="; `*words` takes any number of them, and
 `**overrides` any other key. Types and bounds (`annotated_types`) are checked by pydantic, which is
@@ -22,25 +16,28 @@ imported only when a command runs or shows its help.
 from __future__ import annotations
 
 import difflib
+import functools
 import inspect
 import os
 import signal
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib import import_module
+from inspect import Parameter
 from pathlib import Path
+from pkgutil import resolve_name
 from types import FrameType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from qs3.errors import ConfigError, Qs3Error
-from qs3.utils.threads import let_waiting_threads_sleep
+from qs3.utils.processor import let_waiting_threads_sleep
 from qs3.utils.version import VERSION
 
 INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help", "help")
 _WIDTH = 100
+_AGAIN = "ended; run the same command again and it continues"
 _WORDS = {int: "N", float: "NUMBER", bool: "true|false", Path: "PATH", str: "TEXT"}
 
 Commands = Mapping[str, "str | Commands"]
@@ -49,11 +46,7 @@ command that is meant when a key=value follows."""
 
 
 def run(commands: Commands, argv: Sequence[str], name: str = "qs3", about: str = "") -> int:
-    """Run a command as a process does; returns the exit status.
-
-    A `Qs3Error` is one line on stderr and status 1; a reader that has seen enough (`| head`) ends
-    the command quietly.
-    """
+    """Run a command as a process does; a `Qs3Error` is a line on stderr and exit status 1."""
     let_waiting_threads_sleep()
     try:
         status = _dispatch(commands, list(argv), name, about)
@@ -62,7 +55,7 @@ def run(commands: Commands, argv: Sequence[str], name: str = "qs3", about: str =
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("\ninterrupted; run the same command again and it continues", file=sys.stderr)
+        print(f"\n{_AGAIN}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         _forget_output()
@@ -86,11 +79,10 @@ def _dispatch(commands: Commands, argv: list[str], name: str, about: str) -> int
     elif "" in commands and "=" in first:
         found, rest = commands[""], argv
     else:
-        known = [word for word in commands if word]
-        raise ConfigError(f"unknown command {first!r}; {meant(first, known)}")
+        raise ConfigError(f"unknown command {first!r}; {meant(first, filter(None, commands))}")
     if not isinstance(found, str):
         return _dispatch(found, rest, name, "")
-    function = _function(found)
+    function = resolve_name(found)
     if {*_HELP[:2]} & {*rest} or rest == ["help"]:
         print(_help(function, name))
         return 0
@@ -104,19 +96,16 @@ def parse(function: Callable[..., Any], argv: Sequence[str]) -> tuple[list[Any],
     Raises:
         ConfigError: a key that is unknown, missing or given twice; a value of the wrong type.
     """
-    from pydantic import ConfigDict, ValidationError, create_model
+    from pydantic import ConfigDict, ValidationError, validate_call
 
     from qs3.utils.settings import problems
 
     hints = get_type_hints(function, include_extras=True)
-    known = dict(inspect.signature(function).parameters)
-    bare = [name for name, p in known.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
-    several = [name for name, p in known.items() if p.kind is p.VAR_POSITIONAL]
-    any_key = [name for name, p in known.items() if p.kind is p.VAR_KEYWORD]
-    fields = {name: p for name, p in known.items() if name not in several + any_key}
+    kinds = {name: p.kind for name, p in inspect.signature(function).parameters.items()}
+    bare = [name for name, kind in kinds.items() if kind is Parameter.POSITIONAL_OR_KEYWORD]
+    fields = [*bare, *(name for name, kind in kinds.items() if kind is Parameter.KEYWORD_ONLY)]
     given: dict[str, Any] = {}
     words: list[str] = []
-    others: dict[str, str] = {}
     for word in argv:
         key, equals, value = word.partition("=")
         key = key.removeprefix("paths.") if key.removeprefix("paths.") in fields else key
@@ -125,33 +114,27 @@ def parse(function: Callable[..., Any], argv: Sequence[str]) -> tuple[list[Any],
             key, equals, value = free, "=", word
         if equals and key in given:
             raise ConfigError(f"{key}= is given twice")
-        if equals and key in fields:
-            given[key] = _split(value, hints[key])
-        elif equals and any_key:
-            others[key] = value
-        elif not equals and several:
+        if equals and (key in fields or Parameter.VAR_KEYWORD in kinds.values()):
+            given[key] = _split(value, hints[key]) if key in fields else value
+        elif not equals and not free and Parameter.VAR_POSITIONAL in kinds.values():
             words.append(word)
         else:
             raise ConfigError(f"unknown key {key!r}; {meant(key, fields, '=')}")
-    model = create_model(
-        "Arguments",
-        __config__=ConfigDict(allow_inf_nan=False),
-        **{
-            name: (hints[name], ... if p.default is p.empty else p.default)
-            for name, p in fields.items()
-        },
-    )  # type: ignore[call-overload]
+
+    @functools.wraps(function)
+    def read(*words: Any, **given: Any) -> tuple[list[Any], dict[str, Any]]:
+        return [_home(word) for word in words], {key: _home(v) for key, v in given.items()}
+
+    first = [given.pop(name) for name in bare] if words else []
     try:
-        read = model.model_validate(given)
+        checked: Any = validate_call(config=ConfigDict(allow_inf_nan=False))(read)
+        return checked(*first, *words, **given)
     except ValidationError as error:
         raise ConfigError(problems(error)) from None
-    values = {name: getattr(read, name) for name in fields}
-    for name, value in values.items():
-        if isinstance(value, Path):
-            values[name] = value.expanduser()
-    if several:
-        return [*(values.pop(name) for name in bare), *words], values | others
-    return [], values | others
+
+
+def _home(value: Any) -> Any:
+    return value.expanduser() if isinstance(value, Path) else value
 
 
 def meant(word: str, known: Iterable[str], end: str = "") -> str:
@@ -175,16 +158,12 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
             _forget_output()
             sys.exit(BROKEN_PIPE)
         except (KeyboardInterrupt, SystemExit) as error:
+            status = INTERRUPTED
             if isinstance(error, SystemExit) and error.code == TERMINATED:
-                what, status = "terminated", TERMINATED
-            elif isinstance(error, KeyboardInterrupt) or isinstance(
-                error.__context__,
-                KeyboardInterrupt,  # Lightning's way to end
-            ):
-                what, status = "interrupted", INTERRUPTED
-            else:
-                raise
-            print(f"\n{what}; run the same command again and it continues", file=sys.stderr)
+                status = TERMINATED
+            elif not any(isinstance(e, KeyboardInterrupt) for e in (error, error.__context__)):
+                raise  # the second is Lightning's way to end
+            print(f"\n{_AGAIN}", file=sys.stderr)
             sys.exit(status)
 
     return command
@@ -201,27 +180,19 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise SystemExit(TERMINATED)
 
 
-def _function(where: str) -> Callable[..., Any]:
-    module, _, name = where.partition(":")
-    function: Callable[..., Any] = getattr(import_module(module), name)
-    return function
-
-
 def _summary(found: str | Commands) -> str:
     if not isinstance(found, str):
-        return f"one of {', '.join(word for word in found if word)}"
-    return (inspect.getdoc(_function(found)) or "").partition("\n")[0].rstrip(".")
+        return f"one of {', '.join(filter(None, found))}"
+    return (inspect.getdoc(resolve_name(found)) or "").partition("\n")[0].rstrip(".")
 
 
 def _split(value: str, hint: Any) -> Any:
     """A list of the words between commas where the type is a sequence."""
     if value == "null":
         return None
-    kinds = [get_origin(kind) or kind for kind in _kinds(hint)]
-    if not {tuple, list} & {*kinds}:
+    if not {tuple, list} & {get_origin(kind) for kind in _kinds(hint)}:
         return value
-    inner = value.removeprefix("[").removesuffix("]")
-    return [word.strip() for word in inner.split(",") if word.strip()]
+    return [part.strip() for part in value.strip("[]").split(",") if part.strip()]
 
 
 def _kinds(hint: Any) -> list[Any]:
@@ -274,7 +245,8 @@ def _page(name: str, summary: str, rows: Sequence[tuple[str, str]], about: str =
     column = min(max((len(left) for left, _ in rows), default=0), 24) + 4
     lines = [f"{name}: {summary}" if summary else name, ""]
     for left, right in rows:
-        begin = f"  {left}".ljust(column)
-        begin = begin if len(left) + 4 <= column else f"  {left}\n{' ' * column}"
+        begin = (
+            f"  {left}".ljust(column) if len(left) + 4 <= column else f"  {left}\n{' ' * column}"
+        )
         lines.append(begin + f"\n{' ' * column}".join(textwrap.wrap(right, _WIDTH - column)))
     return "\n".join([*lines, *(["", about] if about else [])])

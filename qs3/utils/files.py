@@ -19,18 +19,13 @@ from typing import Any
 
 from qs3.errors import DataError, MissingDataError, Qs3Error
 
-_CHUNK = 1 << 20
-
 
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path in the folder of `path`; rename it to `path` if the block succeeds.
 
     It has the same extension (some writers choose the format by it). If the block raises, the
-    temporary file is removed and `path` stays as it was.
-
-    Raises:
-        Qs3Error: the folder or file cannot be written (permission, full disk, a file in the way).
+    temporary file is removed and `path` stays as it was; an OSError becomes a Qs3Error.
     """
     path = Path(path)
     temporary = None
@@ -48,10 +43,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary = None
         _flush(path.parent)
     except OSError as error:
-        raise Qs3Error(
-            f"cannot write {path}: {error}; free some space, check the "
-            "permissions, or choose another folder"
-        ) from error
+        raise Qs3Error(f"cannot write {path}: {error}") from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
@@ -59,12 +51,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def reading(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn whatever the block raises on a damaged file into a DataError that names it.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: anything else is wrong with it.
-    """
+    """Turn whatever the block raises on a damaged file into a DataError that names it."""
     try:
         yield
     except FileNotFoundError as error:
@@ -80,15 +67,10 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     """Make a folder and its parents; Qs3Error if it cannot be made or written to."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise Qs3Error(f"cannot make the folder {path}: {error}; choose another one") from error
-    try:  # permissions do not tell: not those of root, nor of a disk that is read-only
-        with tempfile.TemporaryFile(dir=path):
+        with tempfile.TemporaryFile(dir=path):  # permissions do not tell, root's and read-only
             pass
     except OSError as error:
-        raise Qs3Error(
-            f"cannot write in {path} ({error}); check the permissions or choose another folder"
-        ) from error
+        raise Qs3Error(f"cannot write in {path}: {error}") from error
     return Path(path)
 
 
@@ -109,19 +91,15 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def sha256_file(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file's bytes as 64 hex digits, read in pieces of 1 MiB."""
-    digest = hashlib.sha256()
+    """SHA-256 of a file's bytes as 64 hex digits."""
     with open(path, "rb") as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> None:
     """Delete temporary files that a killed process left directly in `folder`.
 
-    Call it only where nobody else is writing (under `locked`, or on one's own run folder). Nothing
-    happens if there is no such folder.
+    Only where no other process writes: under `locked`, or in one's own run folder.
     """
     for path in Path(folder).glob(".*.*.tmp*"):
         if path.is_file():

@@ -30,13 +30,7 @@ _STOP_S = 10.0  # how long a worker may take to end before it is killed
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Generic[Result]):
-    """What became of a task.
-
-    Attributes:
-        result: what the worker returned; None if it died.
-        died: the task's process ended each time before it was done: out of memory, a crash, or
-            killed.
-    """
+    """What became of a task; `died`: its process ended each time before it was done."""
 
     name: str
     result: Result | None
@@ -74,9 +68,8 @@ class Processes:
     their parent, and end with it however it ends. A task whose process dies is tried once more,
     in a new process while no other one works.
 
-    Args:
-        workers: how many at once; 0 does the tasks here, one after the other (for tests and
-            debuggers).
+    Attributes:
+        workers: how many at once; 0 does the tasks here, one after the other.
         tasks_per_process: after so many a process is replaced (where memory creeps).
     """
 
@@ -95,19 +88,14 @@ class Processes:
         make_worker: Callable[[], Callable[[Task], Result]],
         tasks: Iterable[tuple[str, Task]],
     ) -> Iterator[Outcome[Result]]:
-        """Do the tasks.
+        """Do the tasks; yields one outcome a task, in the order in which they are done.
+
+        What a worker raises ends everything; failures that must not are results.
 
         Args:
             make_worker: called once in each process; what it returns is called with each task.
                 It, the tasks and the results are picklable.
-            tasks: names and tasks; taken one by one, when somebody is free for them.
-
-        Yields:
-            One outcome a task, in the order in which they are done.
-
-        Raises:
-            Exception: what a worker raises ends everything; failures that must not are results.
-            OSError: there can be no more processes.
+            tasks: names and tasks; taken one by one, when a worker is free.
         """
         if self.workers:
             yield from self._run(make_worker, tasks)
@@ -127,14 +115,16 @@ class Processes:
         outcomes: list[Outcome[Result]] = []
         try:
             while True:
-                # Nobody gets new work while one is to be tried again alone.
-                while not suspects and (free := self._free(crew)):
+                # There is no new work while one is to be tried again alone.
+                while not suspects:
+                    free = next((worker for worker in crew if worker.task is None), None)
+                    if free is None and len(crew) >= self.workers:
+                        break
                     if (task := next(waiting, None)) is None:
                         break
-                    worker = free[0] or _Worker(make_worker)
-                    if worker not in crew:
-                        crew.append(worker)
-                    worker.give(*task)
+                    if free is None:
+                        crew.append(free := _Worker(make_worker))
+                    free.give(*task)
                 # After they have new work: whoever takes the outcomes may be slow.
                 yield from outcomes
                 outcomes.clear()
@@ -154,25 +144,15 @@ class Processes:
                     return
                 while crew:
                     crew.pop().stop()
-                while suspects:
-                    yield _alone(make_worker, *suspects.pop(0))
+                for name, again in suspects:
+                    crew.append(_Worker(make_worker))
+                    crew[0].give(name, again)
+                    yield crew[0].receive() or Outcome(name, None, died=True)
+                    crew.pop().stop()
+                suspects.clear()
         finally:
             for worker in crew:
                 worker.stop()
-
-    def _free(self, crew: list[_Worker]) -> list[_Worker | None]:
-        """The workers without a task; None stands for one that is still to be started."""
-        idle: list[_Worker | None] = [worker for worker in crew if worker.task is None]
-        return idle or [None] * (len(crew) < self.workers)
-
-
-def _alone(make_worker: Callable[[], Callable[[Any], Any]], name: str, task: Any) -> Outcome[Any]:
-    worker = _Worker(make_worker)
-    try:
-        worker.give(name, task)
-        return worker.receive() or Outcome(name, None, died=True)
-    finally:
-        worker.stop()
 
 
 class _Worker:
@@ -225,9 +205,8 @@ class _Worker:
 def _held_back() -> Iterator[None]:
     """Ctrl-C and SIGTERM come after this, so that no process is started by half.
 
-    It would not be told all that it is to know, and says so in a traceback. A process that is
-    started inherits the mask and takes it off itself. The mask is this thread's: a signal that
-    another thread takes is handled in the main one, and waits in a handler of its own.
+    A process that is started inherits the mask and takes it off itself. The mask is this thread's:
+    a signal that another thread takes is handled in the main one, and waits in its own handler.
     """
     arrived: list[int] = []
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
@@ -249,10 +228,7 @@ def _held_back() -> Iterator[None]:
 
 @contextmanager
 def _a_method_that_it_knows() -> Iterator[None]:
-    """A process is told which start method is the default here, and takes it over.
-
-    In a job of joblib's (a run of a sweep) that is one of joblib's own, at which it would end.
-    """
+    """A new process takes over the default start method, and would end at one of joblib's own."""
     method = multiprocessing.get_start_method(allow_none=True)
     if method is None or method in multiprocessing.get_all_start_methods():
         yield
@@ -266,10 +242,10 @@ def _a_method_that_it_knows() -> Iterator[None]:
 
 @contextmanager
 def _no_script(make_worker: Callable[[], Any]) -> Iterator[None]:
-    """A process runs the script that started it, unless nobody tells it which one that was.
+    """A new process does not run the script that started it, unless its work is defined there.
 
-    Work that does not come from the script has no need of it, and a script that asks for a dataset
-    in its first lines, without `if __name__ == "__main__"`, would do so again in each process.
+    A script that asks for a dataset in its first lines, without `if __name__ == "__main__"`, would
+    do so again in each process.
     """
     if b"__main__" in pickle.dumps(make_worker):
         yield
@@ -309,10 +285,7 @@ def _die_with_parent() -> None:
 
 
 def portable(error: Exception) -> Exception:
-    """A worker's error for its parent, with where it was raised as a note.
-
-    Or, if it cannot be pickled, what it says.
-    """
+    """A worker's error for its parent, with where it was raised; if it can be pickled."""
     where = "".join(traceback.format_exception(error))
     try:
         error.add_note(f"in a worker process:\n{where}")

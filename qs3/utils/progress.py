@@ -25,11 +25,33 @@ def progress_bar(label: str, *, total: int, done: int = 0) -> Iterator[Callable[
 
     Of `total` steps an earlier run has `done` some.
     """
-    if sys.stderr.isatty():
-        with _rich_bar(label, total, done) as advance:
-            yield advance
-    else:
-        yield _LogLines(label, total, done).advance
+    start = last = time.monotonic()
+    steps = done
+
+    def rate() -> float:
+        return (steps - done) / max(time.monotonic() - start, 1e-9)
+
+    def log_line() -> None:
+        nonlocal steps, last
+        steps += 1
+        if time.monotonic() - last >= SECONDS_BETWEEN_LINES or steps >= total:
+            last = time.monotonic()
+            left = (total - steps) / rate()
+            line = "%s: %d of %d, %s, %.0f s left"
+            log.info(line, label, steps, total, _speed(rate()), left)
+
+    if not sys.stderr.isatty():
+        yield log_line
+        return
+    with terminal_bar("{task.fields[rate]}") as bar:
+        task = bar.add_task(label, total=total, completed=done, rate="")
+
+        def advance() -> None:
+            nonlocal steps
+            steps += 1
+            bar.update(task, advance=1, rate=_speed(rate()))
+
+        yield advance
 
 
 def shown(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
@@ -50,24 +72,17 @@ def terminal_bar(*fields: str, transient: bool = False) -> Progress:
 
     Fields are formats of rich: "epochs," or "{task.fields[rate]}". A transient bar goes away.
     """
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        *map(TextColumn, fields),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+    return progress.Progress(
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        *map(progress.TextColumn, fields),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
         console=Console(stderr=True),
         transient=transient,
         # What goes to a file or a pipe stays what it is; on a terminal it goes above the bar.
@@ -75,41 +90,5 @@ def terminal_bar(*fields: str, transient: bool = False) -> Progress:
     )
 
 
-@contextmanager
-def _rich_bar(label: str, total: int, done: int) -> Iterator[Callable[[], None]]:
-    start, steps = time.monotonic(), 0
-    with terminal_bar("{task.fields[rate]}") as bar:
-        task = bar.add_task(label, total=total, completed=done, rate="")
-
-        def advance() -> None:
-            nonlocal steps
-            steps += 1
-            rate = steps / max(time.monotonic() - start, 1e-9)
-            bar.update(task, advance=1, rate=_speed(rate))
-
-        yield advance
-
-
-class _LogLines:
-    """A line every few seconds, and one at the end."""
-
-    def __init__(self, label: str, total: int, done: int) -> None:
-        self.label, self.total, self.done = label, total, done
-        self.first = done
-        self.start = self.last = time.monotonic()
-
-    def advance(self) -> None:
-        self.done += 1
-        now = time.monotonic()
-        if now - self.last < SECONDS_BETWEEN_LINES and self.done < self.total:
-            return
-        self.last = now
-        rate = (self.done - self.first) / max(now - self.start, 1e-9)
-        left = (self.total - self.done) / rate if rate else float("nan")
-        log.info(
-            "%s: %d of %d, %s, %.0f s left", self.label, self.done, self.total, _speed(rate), left
-        )
-
-
 def _speed(rate: float) -> str:
-    return f"{rate:.1f}/s" if rate >= 1 or rate == 0 else f"{1 / rate:.1f} s each"
+    return f"{rate:.1f}/s" if rate >= 1 else f"{1 / rate:.1f} s each"

@@ -56,7 +56,7 @@ def problems(error: ValidationError, place: str = "") -> str:
     lines = []
     for one in error.errors(include_url=False):
         where = ".".join([place] * bool(place) + [str(p) for p in one["loc"] if isinstance(p, str)])
-        if one["type"] == "missing":
+        if one["type"].startswith("missing"):
             lines.append(f"{where}= is missing")
         elif one["type"] == "assertion_error":  # of several fields together
             lines.append(f"{where}: {one['msg'].removeprefix('Assertion failed, ')}")

@@ -15,10 +15,9 @@ def aligned(rows: Rows, *, numbers: bool = False, rule: bool = True) -> list[str
 
     With `numbers` all columns but the first are flush right; `rule` is dashes below the header.
     """
-    lines = ["  ".join(cells).rstrip() for cells in _padded(rows, numbers)]
-    if rule:
-        lines.insert(1, "  ".join("-" * width for width in _widths(rows)))
-    return lines
+    widths = _widths(rows)
+    lines = ["  ".join(cells).rstrip() for cells in _padded(rows, widths, numbers)]
+    return [lines[0], *["  ".join("-" * width for width in widths)] * rule, *lines[1:]]
 
 
 def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
@@ -27,12 +26,11 @@ def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
     A `|` in a cell is escaped; what else Markdown reads as a sign is kept.
     """
     rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
-    lines = [f"| {' | '.join(cells)} |" for cells in _padded(rows, numbers)]
-    first, *others = _widths(rows)
+    widths = _widths(rows)
+    first, *lines = [f"| {' | '.join(cells)} |" for cells in _padded(rows, widths, numbers)]
     end = ":" if numbers else "-"
-    rules = ["-" * (first + 2), *("-" * (width + 1) + end for width in others)]
-    lines.insert(1, f"|{'|'.join(rules)}|")
-    return lines
+    rules = ["-" * (widths[0] + 2), *("-" * (width + 1) + end for width in widths[1:])]
+    return [first, f"|{'|'.join(rules)}|", *lines]
 
 
 def csv_text(rows: Iterable[Iterable[Any]]) -> str:
@@ -56,12 +54,7 @@ def _widths(rows: Rows) -> list[int]:
     return [max(map(len, column)) for column in zip(*rows, strict=True)]
 
 
-def _padded(rows: Rows, numbers: bool) -> list[list[str]]:
-    widths = _widths(rows)
-    return [
-        [
-            cell.rjust(width) if numbers and i else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        for row in rows
-    ]
+def _padded(rows: Rows, widths: Sequence[int], numbers: bool) -> list[list[str]]:
+    right = [numbers and i > 0 for i in range(len(widths))]
+    sides = [str.rjust if at_right else str.ljust for at_right in right]
+    return [[f(c, w) for f, c, w in zip(sides, row, widths, strict=True)] for row in rows]

@@ -24,11 +24,6 @@ def commit() -> str:
         return ""
 
 
-def in_words(version: str, commit: str) -> str:
-    """Such as "qs3 0.1.0, commit 0123456789ab"."""
-    return f"qs3 {version}" + f", commit {commit}" * bool(commit)
-
-
 def _git(*words: str) -> str:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     done = subprocess.run(

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from qs3.utils.threads import let_waiting_threads_sleep
+from qs3.utils.processor import let_waiting_threads_sleep
 from tests.benchmarks.timing import DEVICE, ENABLED, THREADS
 
 if ENABLED:

@@ -15,7 +15,7 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.utils.threads import cores
+from qs3.utils.processor import cores
 
 ENABLED = "--benchmark-enable" in sys.argv  # else everything runs once, small
 THREADS = int(os.environ.get("QS3_BENCH_THREADS") or len(cores()))  # as a training takes them

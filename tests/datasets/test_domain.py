@@ -11,7 +11,7 @@ import pytest
 from hydra.utils import instantiate
 
 from qs3.classes import CLASSES
-from qs3.commands.scannet import scannet
+from qs3.commands.download import scannet
 from qs3.config.hydra import build
 from qs3.datasets import domain as module
 from qs3.datasets.domain import Domain, check_or_make

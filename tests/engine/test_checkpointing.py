@@ -12,7 +12,7 @@ from qs3.engine import checkpointing
 from qs3.engine.checkpointing import AtomicCheckpointIO, Clock
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
-from qs3.utils.processor_time import Moment
+from qs3.utils.processor import Moment
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.watching import interrupt
 

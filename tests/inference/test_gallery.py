@@ -1,58 +1,47 @@
-"""What the page of predictions keeps of its objects while others are read."""
+"""What the page of predictions keeps of its objects, and what it says of labels."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from qs3.inference.inputs import Sample
-from qs3.inference.page import Gallery, around, depth_png, page
+from qs3.inference.inputs import Sample, around
+from qs3.inference.page import first_of, page
 
 HIGH, WIDE = 240, 320
+CLASSES = ("a", "b")
 
 
-def frame(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0.5, 4.0, size=(HIGH, WIDE))
-
-
-def box(top: int, left: int, bottom: int, right: int) -> np.ndarray:
-    mask = np.zeros((HIGH, WIDE), dtype=bool)
-    mask[top:bottom, left:right] = True
-    return mask
+def predicted(name: str, sure: float = 0.75, **more) -> Sample:
+    each = np.array([sure, 1 - sure])
+    return Sample(name, np.eye(3), 0, probabilities=each, cls="a", **more)
 
 
 @pytest.mark.parametrize(
-    "mask",
+    "box",
     [
-        box(100, 120, 130, 180),
-        box(0, 0, 20, 20),
-        box(HIGH - 9, 40, HIGH, 90),
-        box(30, WIDE - 1, 200, WIDE),
-        box(0, 0, HIGH, WIDE),
-        box(7, 11, 8, 12),
+        (100, 120, 130, 180), (0, 0, 20, 20), (HIGH - 9, 40, HIGH, 90), (30, WIDE - 1, 200, WIDE),
+        (0, 0, HIGH, WIDE), (7, 11, 8, 12),
     ],
-)
-def test_the_part_that_is_shown_is_shown_alike(mask: np.ndarray) -> None:
-    depth = frame(0)
-    part = around(depth, mask)
-    assert part[1].sum() == mask.sum()
-    assert depth_png(*part) == depth_png(depth, mask)
+)  # fmt: skip
+def test_the_part_around_an_object_holds_it_and_no_frame(box) -> None:
+    top, left, bottom, right = box
+    mask = np.zeros((HIGH, WIDE), dtype=bool)
+    mask[top:bottom, left:right] = True
+    depth, own = around(np.random.default_rng(0).uniform(0.5, 4.0, size=(HIGH, WIDE)), mask)
+    assert own.sum() == mask.sum()
+    assert depth.base is None
+    assert depth.shape == own.shape
+    assert max(depth.shape) <= 1.8 * max(bottom - top, right - left) + 10
 
 
-def test_no_object_keeps_its_frame() -> None:
-    """Twenty of 60 come first, and of each the part around it is kept, once."""
-    gallery = Gallery(("a", "b"), most=20)
-    mask = box(100, 100, 120, 130)
-    for i in range(60):
-        sample = Sample(f"{i}", np.zeros((8, 3)), 0, picture=(frame(i), mask))
-        gallery.add(sample.row("", np.array([0.5 + i / 200, 0.5 - i / 200])), sample)
-    shown = gallery.shown()
-    assert [row.file for row, _ in shown] == [str(i) for i in range(20)]  # least sure first
-    for row, sample in shown:
-        depth, own = sample.picture
-        assert depth.base is None
-        assert depth.nbytes < 100 * 100 * 8
-        assert depth_png(depth, own) == depth_png(frame(int(row.file)), mask)
+def test_twenty_of_sixty_come_first_and_the_others_are_let_go() -> None:
+    samples = [predicted(str(i), 0.5 + i / 200) for i in range(60)]
+    shown = first_of(samples, CLASSES, 20)
+    assert [one.name for one in shown] == [str(i) for i in range(20)]  # least sure first
+    assert [one.cloud is None for one in samples] == [False] * 20 + [True] * 40
+    errors = [predicted(str(i), 0.5 + i / 200, label="b") for i in range(60)]
+    assert [one.name for one in first_of(errors, CLASSES, 2)] == ["59", "58"]  # most sure first
 
 
 @pytest.mark.parametrize(
@@ -60,24 +49,16 @@ def test_no_object_keeps_its_frame() -> None:
     [("", "No labels were given:"), ("mug", "No label given is a class of the net:")],
 )
 def test_the_page_says_why_nothing_was_judged(label: str, said: str) -> None:
-    gallery = Gallery(("a", "b"))
-    sample = Sample("x.npy", np.eye(3), 0, label=label)
-    row = sample.row("", np.array([0.75, 0.25]))
-    gallery.add(row, sample)
-    text = page("x", [row], gallery, ("a", "b"))
+    one = predicted("x.npy", label=label)
+    text = page("x", [one], [one], CLASSES)
     assert said in text
     assert text.count("it is not known which are right") == 1
 
 
 @pytest.mark.parametrize("third", ["", "mug"])
 def test_what_has_a_label_of_another_class_is_not_called_unlabelled(third: str) -> None:
-    """Its heading counted it; the line above, which counts what has none, did not."""
-    gallery, rows = Gallery(("a", "b")), []
-    for name, label in (("x", "a"), ("y", ""), ("z", third)):
-        sample = Sample(name, np.eye(3), 0, label=label)
-        rows.append(sample.row("", np.array([0.75, 0.25])))
-        gallery.add(rows[-1], sample)
-    text = page("x", rows, gallery, ("a", "b"))
+    samples = [predicted("x", label="a"), predicted("y"), predicted("z", label=third)]
+    text = page("x", samples, first_of(samples, CLASSES), CLASSES)
     assert f"Without a label, not counted: {1 if third else 2}<" in text
     heading = "Without a label that is a class of the net" if third else "Without a label"
     assert f"<h2>{heading}: 2 <" in text

@@ -5,9 +5,7 @@ import numpy as np
 from qs3.report import sheets
 from qs3.store.store import ManifestRow, write_pointset
 from qs3.utils.pictures import save_png
-from tests.fixtures.published import write_domain
 from tests.report.made_runs import not_blank
-from tests.running import main
 
 
 def store(folder, ids, **more):
@@ -49,15 +47,3 @@ def test_what_is_drawn_is_not_at_even_steps():
     assert found == sorted({*found})
     assert len({i % 10 for i in found}) > 4
     assert sheets.drawn(np.array([5, 7]), 2) == [5, 7]
-
-
-def test_command(tmp_path, capsys):
-    for name in ("specklenet10", "kinectsim10"):
-        write_domain(name, tmp_path, {"train": 1, "test": 1}, published=False)
-    picture = tmp_path / "alone" / "scans.png"
-    words = ["report", "pictures", f"data_dir={tmp_path}", f"out={picture}"]
-    assert main([*words, "domains=[specklenet10,kinectsim10]"]) == 0
-    assert capsys.readouterr().out == f"{picture}\n"
-    assert not_blank(picture)
-    assert main([*words, "domains=[scannet10]"]) == 1
-    assert "MissingDataError: domain scannet10" in capsys.readouterr().err

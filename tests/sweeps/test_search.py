@@ -21,7 +21,7 @@ from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE, OBJECTIVES, check_objective
 from qs3.sweeps.search import Tried, check_varied, distribution, report, split, words
 from qs3.training.command import judged, objective_of, train
-from qs3.utils.locks import alone
+from qs3.utils.locks import locked
 from tests.running import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
@@ -65,7 +65,7 @@ def test_it_finds_goes_on_and_is_repeatable(tmp_path):
 
     search(parts, 3)
     (lock,) = (parts / "logs" / "searches").glob(".*.lock")
-    with alone(lock, "held twice"):  # by a search that is still running: its trials are its own
+    with locked(lock, "held twice"):  # by a search that is still running: its trials are its own
         result = search(parts, 9)
     assert result.returncode == 1
     assert "another process is searching in" in result.stderr

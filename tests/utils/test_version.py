@@ -51,8 +51,3 @@ def test_an_installed_package_has_none_though_it_lies_in_somebody_s_checkout(tmp
     inner = tmp_path / ".venv" / "site-packages"
     inner.mkdir(parents=True)
     assert commit(inner) == ""
-
-
-def test_in_words():
-    assert version.in_words("0.1.0", "") == "qs3 0.1.0"
-    assert version.in_words("0.1.0", "0123456789ab") == "qs3 0.1.0, commit 0123456789ab"

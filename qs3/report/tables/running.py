@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from qs3.config.compose import override
 from qs3.config.location import python_command
-from qs3.config.quoting import override
 from qs3.report.tables.spec import chosen
 from qs3.report.tables.table import Table
 

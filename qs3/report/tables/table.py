@@ -17,9 +17,8 @@ from typing import Any, get_args
 import pandas as pd
 from omegaconf import DictConfig
 
-from qs3.config.compose import choices, composed
+from qs3.config.compose import choices, composed, override
 from qs3.config.location import typed
-from qs3.config.quoting import override
 from qs3.errors import ConfigError, DataError
 from qs3.report.tables.results import (
     FEW_SEEDS,

@@ -10,7 +10,7 @@ from annotated_types import Ge
 
 from qs3.sensors.matching.base import Match
 from qs3.sensors.optics.visibility import Reason, first_reason
-from qs3.utils.jit import has_numba
+from qs3.utils.processor import has_numba
 from qs3.utils.settings import IsOdd, settings
 
 

@@ -1,11 +1,38 @@
-"""`qs3 fit`: a preset for one's own depth camera."""
+"""`qs3 bench` and `qs3 fit`: depth sensors before known targets, and a preset for one's own."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
 
-from annotated_types import Gt
+from annotated_types import Ge, Gt
+
+
+def bench(
+    *,
+    sensor: Annotated[tuple[str, ...], "of conf/sensor; all presets by default"] = (),
+    quick: Annotated[bool, "few conditions: seconds a sensor"] = False,
+    samples: Annotated[int, Ge(1), "rays a pixel of the renderer"] = 16,
+    out: Annotated[Path, "folder of the page and its numbers"] = Path("out/bench"),
+    **overrides: Annotated[str, "settings of all sensors (sensor.KEY), or hydra.searchpath"],
+) -> int:
+    """Measure depth sensors before known targets: are their errors those of the device?
+
+    Renders planes and an edge, and writes a page (index.md) and all numbers (planes.csv, edges.csv,
+    bands.csv). The exit status is 1 if a band does not hold.
+
+    Example:
+        qs3 bench sensor=kinect_v1,realsense_d435 quick=true
+        qs3 bench sensor=kinect_v1 sensor.infrared.read_noise_e=20
+    """
+    from qs3.calibration.bench import run
+
+    words = [f"{key}={value}" for key, value in overrides.items()]
+    failed = [band for band in run(sensor, words, quick, samples, out) if not band.holds]
+    for band in failed:
+        print(f"FAIL {band.sensor}: {band.band}: {band.value:.3g} ({band.low:g} to {band.high:g})")
+    print(f"saved {out / 'index.md'}, planes.csv, edges.csv and bands.csv")
+    return 1 if failed else 0
 
 
 def fit(
@@ -13,13 +40,9 @@ def fit(
     out: Annotated[Path, "the preset, conf/sensor/NAME.yaml"],
     plot: Annotated[Path | None, "the picture of data and law, .png (default: next to out)"] = None,
     intrinsics: Annotated[str | None, "fx,fy,cx,cy in px, or a file that has them"] = None,
-    focal: Annotated[
-        float | None, Gt(0), "px, in place of intrinsics=; the principal point is the middle"
-    ] = None,
+    focal: Annotated[float | None, Gt(0), "px, in place of intrinsics=; centred"] = None,
     unit: Annotated[str | None, "m, mm or units a metre (default: mm of whole numbers)"] = None,
-    distances: Annotated[
-        tuple[float, ...], "true ones of each frame's middle, m: for the bias"
-    ] = (),
+    distances: Annotated[tuple[float, ...], "true ones of each frame's middle, m: the bias"] = (),
     baseline: Annotated[
         float | None, "m from camera to projector, negative to the left: for the shadows"
     ] = None,
@@ -44,7 +67,6 @@ def fit(
     Example:
         qs3 fit frames/*.png intrinsics=580,580,319.5,239.5 out=conf/sensor/my_camera.yaml
         qs3 fit images=pictures distance=1.2 out=conf/sensor/my_stereo.yaml
-        qs3-generate domain=specklenet10 renderer=mitsuba sensor=my_camera
     """
     from qs3.errors import ConfigError
     from qs3.utils.files import write_text
