@@ -129,7 +129,7 @@ class LabelFreeSearch(OverLauncher):
         loader = self.hydra_context.config_loader
         for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             one = loader.load_sweep_config(self.config, [*fixed, *overrides(words(trial.params))])
-            one = OmegaConf.masked_copy(one, [key for key in one if key != "hydra"])
+            one = OmegaConf.masked_copy(one, [str(key) for key in one if key != "hydra"])
             if check_finished(one, "or begin another search with another experiment_name"):
                 return
 
