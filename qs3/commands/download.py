@@ -71,7 +71,7 @@ def listing() -> str:
         lines.append(source.name)
         add(source.title)
         add(f"for {', '.join(f'domain={d}' for d in source.domains) or 'qs3-generate meshes='}")
-        add(f"size: {source.size_says}; file: {source.file}; from: {source.address}")
+        add(f"size: {source.size_says}; file: {source.file}; from: {source.page}")
         add(f"terms: {source.terms}{need}")
     lines += ["", "By hand (NAME prints how)"]
     for name, one in BY_HAND.items():

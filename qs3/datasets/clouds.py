@@ -1,9 +1,9 @@
-"""Point clouds of any number of points from files in the usual formats.
+"""Your own point clouds, of any number of points: files in the usual formats, and folders of them.
 
-    .xyz .txt   text, a row a point: x y z and perhaps more columns, by blanks, commas or
-                semicolons, with decimal points or commas; # and // begin a comment. A first row
-                of names gives the columns x, y and z, also as a comment
-    .npy        [n, >= 3], or [m, n, >= 3]: m clouds; or [n] or [m, n] of records x, y, z
+    .xyz .txt   text, a row a point: x y z and perhaps more columns, between blanks, commas or
+                semicolons; # and // begin a comment. A first row of names, also as a comment,
+                says which columns are x, y and z
+    .npy        [n, >= 3], or [m, n, >= 3]: m clouds
     .npz        the array `points` (or the only one) as in .npy; perhaps `label` or `cls`
     .ply        the vertices, text or binary; faces are passed over
     .pcd        x y z
@@ -14,39 +14,49 @@ Only x y z are read. Pickled arrays are refused unopened.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import logging
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from annotated_types import Ge
 from jaxtyping import Float
 
+from qs3.datasets.importing import (
+    Importer,
+    Item,
+    UpAxis,
+    by_class,
+    class_of,
+    cloud_id,
+    split_of,
+    visible,
+)
 from qs3.errors import DataError
+from qs3.store.manifest import ManifestRow
+from qs3.store.meta import MadeOf
 from qs3.utils.files import reading
+from qs3.utils.settings import settings
 
-NOTHING = "NaN, infinite or (0, 0, 0)"
-"""What stands for no measurement, for messages."""
+log = logging.getLogger(__name__)
 
 _XYZ = ["x", "y", "z"]
-_USUAL = {  # names of columns in comments, which may be about anything
-    *("x", "y", "z", "r", "g", "b", "a", "rgb", "rgba", "red", "green", "blue", "alpha", "i"),
-    *("intensity", "reflectance", "id", "index", "point", "label", "class", "t", "time"),
-    *("timestamp", "ring", "nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "curvature"),
-}
-_DECIMAL_COMMA = re.compile(r"[-+]?(\d+,\d+|\d*\.?\d*)([eE][-+]?\d+)?")
 _ENDS = ",; \t"  # of a row
 _MOST_COLUMNS = 32  # x y z, normals, colours and what else programs write; a picture has more
 _FEW = 10  # more columns than that in three rows: points stand in columns
-_PICTURES = {
-    *((240, 320), (480, 640), (424, 512), (576, 640), (270, 480), (360, 640), (480, 848)),
-    *((540, 960), (720, 1280), (960, 1280), (1080, 1920)),
-}
-"""Height and width of depth cameras' pictures; so many clouds of so many points are not likely."""
 _MOST = 1e18  # of a coordinate: squares of distances overflow in float32 from about 1e19 on
 _FINE = 2.0**-13  # of the cloud, that a step of float32 may be: 0.1 mm of a chair
+
+_SPLIT_NAMES = ("train", "test", "val", "validation")
+_SPLIT_PREFIX = re.compile(rf"({'|'.join(_SPLIT_NAMES)})(?![a-z])", re.IGNORECASE)  # train_0.h5
+_MANY = (".npy", ".npz", ".h5", ".hdf5")  # may hold several clouds
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +75,7 @@ class CloudFile:
 
 
 def parse_clouds(path: str | Path) -> CloudFile:
-    """All clouds of a file, with the numbers that it holds.
-
-    Raises:
-        DataError: names the file.
-    """
+    """All clouds of a file, with the numbers that it holds; DataError names the file."""
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -104,32 +110,18 @@ def read_arrays(
         return {key: file[key] for key in (*required, *(k for k in optional if k in file))}
 
 
-def read_pcd(path: Path) -> Float[np.ndarray, "h w 3"]:
-    """Positions of a PCD file, NaN where nothing was measured; h is 1 unless it is organised."""
-    from pypcd4 import PointCloud
-
-    with reading(path):
-        cloud = PointCloud.from_path(path)
-        xyz = cloud.numpy(tuple(_XYZ)).astype(np.float64)
-        return xyz.reshape(cloud.metadata.height, cloud.metadata.width, 3)
-
-
 def check_shape(where: Any, shape: tuple[int, ...]) -> None:
-    """Refuse an array of numbers whose rows cannot be points.
+    """Raise DataError for an array whose rows cannot be points: transposed, or a depth image.
 
     Args:
         where: for the message: its file.
         shape: [n, >= 3], a point a row with perhaps more columns; or [m, n, >= 3], m clouds.
-
-    Raises:
-        DataError: transposed (x y z are rows), or rather a depth image; begins with `where`.
     """
     rows, columns = shape[-2:] if len(shape) in (2, 3) else (0, 0)
-    picture = columns > _MOST_COLUMNS or (len(shape) == 3 and shape[:2] in _PICTURES)
-    if columns < 3 or picture or (rows == 3 and columns > _FEW):
+    if not 3 <= columns <= _MOST_COLUMNS or (rows == 3 and columns > _FEW):
         raise DataError(
-            f"{where}: shape {shape}, expected points as rows, [n, 3] or [m, n, 3]; give a depth "
-            "image as depth=, and one organised cloud as cloud.reshape(-1, 3)"
+            f"{where}: shape {shape}, expected points as rows, [n, 3] or [m, n, 3]; a depth image "
+            "goes to depth="
         )
 
 
@@ -137,31 +129,22 @@ def with_depth(cloud: np.ndarray, where: str) -> tuple[np.ndarray, int]:
     """[n, 3] without the points that stand for no measurement, and how many these were.
 
     Depth cameras write NaN, infinity or (0, 0, 0) for a pixel that saw nothing. One point that is
-    exactly (0, 0, 0) stays: a shape about the origin may have it. Several can only stand for
-    nothing, or are one point of a cloud in whole millimetres.
-
-    Raises:
-        DataError: no point is left.
+    exactly (0, 0, 0) stays: a shape about the origin may have it. DataError if no point is left.
     """
     kept = np.isfinite(cloud).all(axis=1)
     nothing = (cloud == 0).all(axis=1)
     if nothing.sum() > 1:
         kept &= ~nothing
     if not kept.any():
-        raise DataError(f"{where}: all {len(cloud)} points are {NOTHING}: nothing was measured")
+        raise DataError(f"{where}: all {len(cloud)} points are NaN, infinite or (0, 0, 0)")
     return (cloud if kept.all() else cloud[kept]), int((~kept).sum())
 
 
 def checked(cloud: np.ndarray, where: str) -> Float[np.ndarray, "n 3"]:
     """[n, 3] of any numbers to float32.
 
-    A map's coordinates are so far from their origin that float32 has steps of decimetres there.
-    Where x or y are too far from 0 for float32's steps they are moved there: no classifier sees
-    where a cloud lies, but z is its height.
-
-    Raises:
-        DataError: no points, a value that is not finite in float32, or above 1e18, where distances
-            are not; z too far from 0, or numbers that have lost their digits already.
+    A map's coordinates are so far from their origin that float32 has steps of decimetres there:
+    such x and y are moved to 0. z is a height and is never moved.
     """
     with np.errstate(over="ignore"):  # becomes infinite, and is reported as such
         small = np.asarray(cloud, dtype=np.float32)
@@ -174,83 +157,174 @@ def checked(cloud: np.ndarray, where: str) -> Float[np.ndarray, "n 3"]:
     coarse = np.spacing(np.abs(small).max(axis=0)) > _FINE * extent
     if extent == 0 or not coarse.any():
         return small
-    lost = cloud.dtype.kind == "f" and cloud.dtype.itemsize < 8
-    if lost or coarse[2]:
+    if coarse[2] or cloud.dtype in (np.float32, np.float16):  # the digits are lost
         raise DataError(
             f"{where}: its coordinates, up to {np.abs(small).max():.7g}, are too large for the "
             f"digits of float32, and the cloud is only {extent:.3g} large; subtract an offset"
         )
-    return (np.asarray(cloud, np.float64) - np.where(coarse, (low + high) / 2, 0)).astype(
-        np.float32
-    )
+    moved: np.ndarray = np.asarray(cloud, np.float64) - np.where(coarse, (low + high) / 2, 0)
+    return moved.astype(np.float32)
 
 
-def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Coordinates of all rows, float64: the columns named x, y and z, else the first three."""
-    text = path.read_bytes().decode("utf-8-sig", "replace").replace("//", "#")
-    lines, names = _named(text.splitlines())
-    rows = [row for line in lines if (row := line.split("#")[0].strip())]
-    first = rows[0] if rows else ""
-    separator = _separator(first)
-    if separator == "decimal comma":
-        rows = [row.replace(",", ".").replace(";", " ") for row in rows]
-        separator = None
-    elif separator:
-        rows = [row.rstrip(_ENDS) for row in rows]
-    table = np.loadtxt(rows, dtype=np.float64, ndmin=2, delimiter=separator, comments=None)
-    check_shape(path, table.shape)
-    if len(names) == table.shape[1]:
-        return table[:, [names.index(axis) for axis in _XYZ]]
-    if names and names[:3] != _XYZ:  # x would be an id, or a colour
-        raise ValueError(
-            f"its first row names {len(names)} columns, the others have another number"
-        )
-    return table[:, :3]
+@settings
+class CloudFolder(Importer):
+    """Your own clouds: a folder of files in any format of this module.
 
+        class/split/name.ext     split is train, test, or val (validation)
+        split/class/name.ext
+        class/name.ext           every `test_every`-th of a class, sorted by name, is for test
+        split/name.ext           no labels
+        name.ext, any/where.ext  no labels: all of it is the split "train"
 
-def _separator(row: str) -> str | None:
-    """What stands between the numbers of a row; None: blanks."""
-    row = row.rstrip(_ENDS)
-    together = re.sub(r"[ \t]*,[ \t]*", ",", row)
-    if "," in row and not re.search(r"[;\s]", together):
-        mixed = bool(re.search(r",[ \t]", row) and re.search(r"\d,\d", row)) and "." not in row
-        words = [] if mixed else together.split(",")
-    elif "," in row or ";" in row:
-        words = re.split(r"[;\s]+", row)
-        if all(map(_DECIMAL_COMMA.fullmatch, words)):
-            return "decimal comma"
-        words = []
-    else:
-        return None
-    if len(words) < 3:
-        raise ValueError(f"{row[:60]!r}: do its commas stand between numbers or within them?")
-    return ","
+    A file may hold several clouds (.npy, .npz, .h5 with an array [m, n, 3]); they are then called
+    name_0000, name_0001, ... If it has labels, numbers count the classes from 0 and words are
+    names. Such a file may have its split before its name, train_0.h5, where no folder is one.
 
+    A cloud with more than P points is thinned to its P farthest; one with fewer repeats its points.
+    Points without depth are left out before (`with_depth`).
 
-def _named(lines: list[str]) -> tuple[list[str], list[str]]:
-    """The lines without a first row of names; and the names, if there are any.
-
-    A comment before all rows may have them as well, if it has no other words.
+    Attributes:
+        layout: "none": no folder is a class or a split.
+        up: the axis that points up in the files.
+        test_every: where all folders are classes; 0 leaves nothing for test.
     """
-    for number, line in enumerate(lines):
-        begin = line.strip()
-        names = _names(begin.lstrip("#"))
-        if begin.startswith("#") or not begin:
-            if names and _USUAL.issuperset(names):
-                return lines[number + 1 :], names
-            continue
-        return (lines[number + 1 :], names) if names else (lines[number:], [])
-    return [], []
+
+    layout: Literal["auto", "none"] = "auto"
+    up: UpAxis = "z"
+    test_every: Annotated[int, Ge(0)] = 5
+    thins: ClassVar[bool] = True
+    holds: ClassVar[str] = "**/* of the formats xyz txt npy npz ply pcd h5 hdf5"
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects=f"own clouds of {self.root.name}")
+
+    def is_there(self) -> bool:
+        """See `Importer`: whether there is any file of a known format."""
+        return next(_files(self.root), None) is not None
+
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """See `Importer`. Sorted by split, class and name."""
+        read = functools.lru_cache(maxsize=1)(parse_clouds)  # one file in memory at a time
+        places = {path: self._place(path, classes) for path in _files(self.root)}
+        found = [
+            item
+            for path, (cls, split) in places.items()
+            for item in self._of_file(path, cls, split, classes, read)
+        ]
+        if self.test_every and all(cls and not split for cls, split in places.values()):
+            found = _with_tests(found, self.test_every)
+        return by_class(found, classes)
+
+    def watched(self) -> Iterable[Path]:
+        """See `Importer`."""
+        return _files(self.root)
+
+    def _place(self, path: Path, classes: Sequence[str]) -> tuple[str, str]:
+        """Class and split of a file by its folders; each "" where they do not say."""
+        if self.layout == "none":
+            return "", ""
+        folders = path.relative_to(self.root).parts[:-1]
+        splits = [name for name in folders if name.casefold() in _SPLIT_NAMES]
+        others = [name for name in folders if name not in splits]
+        if len(splits) > 1 or len(others) > 1:
+            raise DataError(f"{path}: expected a folder of a class, and perhaps one of a split")
+        where = f"{path} (published.layout=none reads without labels)"
+        cls = class_of(others[0], classes, where) if others else ""
+        return cls, split_of(splits[0], path) if splits else ""
+
+    def _of_file(
+        self,
+        path: Path,
+        cls: str,
+        split: str,
+        classes: Sequence[str],
+        read: Callable[[Path], CloudFile],
+    ) -> Iterator[Item]:
+        """The clouds of a file; of those that may hold several only number and labels are kept."""
+        below, file = path.relative_to(self.root), CloudFile((np.empty(0),))
+        if path.suffix.lower() in _MANY:
+            try:
+                file = read(path)
+            except DataError:
+                log.info("%s is damaged", path)  # reading it again says why
+        if file.many and not (cls or split) and (prefix := _SPLIT_PREFIX.match(path.stem)):
+            split = split_of(prefix[1], path)
+        for i in range(len(file.clouds)):
+            number, place = (f"_{i:04d}", f"{below.as_posix()}[{i}]") if file.many else ("", "")
+            place = place or below.as_posix()
+            own = _label(file.labels[i], classes, path) if file.labels and not cls else cls
+            plain = below.with_suffix("").as_posix() if self.layout == "none" else path.stem
+            id_ = cloud_id(own, split or "train", (path.stem if own else plain) + number)
+            row = ManifestRow(id_, own, split or "train", origin=place)
+            yield Item(row, functools.partial(_cloud, read, path, i, f"{self.root}/{place}"))
 
 
-def _names(line: str) -> list[str]:
-    """The words, in small letters, if x, y and z are each among them once; else none."""
-    words = [word.strip('"').lower() for word in re.findall(r"[^,;\s]+", line)]
-    return words if all(words.count(axis) == 1 for axis in _XYZ) else []
+def _cloud(read: Callable[[Path], CloudFile], path: Path, number: int, where: str) -> np.ndarray:
+    """[n, 3] float32, without points that have no depth, and checked."""
+    cloud, dropped = with_depth(read(path).clouds[number], where)
+    if dropped:
+        log.info("%s: points without depth left out: %d", where, dropped)
+    return checked(cloud, where)
+
+
+def _with_tests(items: Iterable[Item], every: int) -> list[Item]:
+    """The last of every `every` of a class, in the order of ids, goes to test."""
+    seen: Counter[str] = Counter()
+    result = []
+    for item in sorted(items, key=lambda item: item.row.id):
+        row = item.row
+        seen[row.cls] += 1
+        if seen[row.cls] % every == 0:
+            id_ = cloud_id(row.cls, "test", row.id.removeprefix(f"{row.cls}/train/"))
+            item = item._replace(row=dataclasses.replace(row, id=id_, split="test"))
+        result.append(item)
+    return result
+
+
+def _label(label: Any, classes: Sequence[str], where: Path) -> str:
+    """The class that a file's own label means: a name, or a number from 0."""
+    if isinstance(label, bytes):
+        label = label.decode(errors="replace")
+    if isinstance(label, int) and 0 <= label < len(classes):
+        return classes[label]
+    return class_of(str(label), classes, where)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """All files of known formats below a folder, in order; links to folders are not followed."""
+    for path in visible(folder):
+        if path.is_dir():
+            if not path.is_symlink():  # it could lead in a circle, or give the same clouds twice
+                yield from _files(path)
+        elif path.suffix.lower() in SUFFIXES and path.is_file():
+            yield path
 
 
 def _text(path: Path) -> CloudFile:
-    return CloudFile((read_text(path),))
+    """Coordinates of all rows, float64: the columns named x, y and z, else the first three."""
+    names: list[str] = []
+    rows: list[str] = []
+    text = path.read_bytes().decode("utf-8-sig", "replace").replace("//", "#")
+    for line in text.splitlines():
+        row, _, comment = (part.strip(_ENDS) for part in line.partition("#"))
+        words = [word.strip('"').lower() for word in re.findall(r"[^,;\s]+", row or comment)]
+        if not rows and all(words.count(axis) == 1 for axis in _XYZ):
+            names = words
+        elif row:
+            rows.append(row)
+    kinds = {*re.findall(r"[,;\s]+", rows[0])}
+    separators = {kind.strip() for kind in kinds}
+    if len(separators) > 1 or (len(kinds) > 1 and separators == {","} and "." not in rows[0]):
+        raise ValueError(f"{rows[0][:60]!r}: its numbers stand between different separators")
+    separator = "".join(separators) or None
+    table = np.loadtxt(rows, dtype=np.float64, ndmin=2, delimiter=separator, comments=None)
+    check_shape(path, table.shape)
+    if len(names) != table.shape[1]:
+        if names and names[:3] != _XYZ:  # x would be an id, or a colour
+            raise ValueError(f"{len(names)} names of columns, but {table.shape[1]} columns")
+        names = _XYZ
+    return CloudFile((table[:, [names.index(axis) for axis in _XYZ]],))
 
 
 def _npy(path: Path) -> CloudFile:
@@ -272,7 +346,9 @@ def _ply(path: Path) -> CloudFile:
 
 
 def _pcd(path: Path) -> CloudFile:
-    return CloudFile((read_pcd(path).reshape(-1, 3),))
+    from pypcd4 import PointCloud
+
+    return CloudFile((PointCloud.from_path(path).numpy(tuple(_XYZ)).astype(np.float64),))
 
 
 def _hdf5(path: Path) -> CloudFile:
@@ -285,9 +361,6 @@ def _hdf5(path: Path) -> CloudFile:
 
 
 def _of_array(array: np.ndarray, labels: np.ndarray | None = None) -> CloudFile:
-    if array.dtype.names:
-        fields = {name.lower(): name for name in array.dtype.names}
-        array = np.stack([array[fields[axis]] for axis in _XYZ], axis=-1)
     assert array.dtype.kind in "fiu", f"the array holds {array.dtype}, not numbers"
     check_shape("the array", array.shape)
     many = array.ndim == 3

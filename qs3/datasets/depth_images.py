@@ -19,7 +19,6 @@ point from there is one pixel less here.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,9 +41,10 @@ CAMERA_UP = np.array([0.0, -1.0, 0.0])
 _MILLIMETRES = (1.0, MILLIMETRE, 1000.0)  # in BOP's, librealsense's and Open3D's words
 _MOST_OBJECTS = 1000  # of a mask: an image with more numbers is something else
 _MATRICES = ("K", "k", "camera_matrix", "intrinsic_matrix", "intrinsics", "intrinsic", "cam_K")
-_DOCUMENT = re.compile(r"^---\s*$", re.MULTILINE)  # begins one, or ends the one before
-_BENT = ("D", "d", "coeffs", "distortion_coefficients")
-_BENT_BY_ONE = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_BENT = (
+    *("D", "d", "coeffs", "distortion_coefficients"),
+    *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
+)
 _UNMEASURED = 65535  # what cameras that have no 0 write into 16 bits
 _OFF = 0.2  # of a side, from the picture's middle
 _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the unit is wrong
@@ -52,12 +52,7 @@ _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the unit is wrong
 
 @settings
 class Pinhole:
-    """A pinhole without distortion whose pixels need not be square.
-
-    Attributes:
-        fx_px, fy_px: focal lengths.
-        cx_px, cy_px: principal point; the centre of the top left pixel is (0, 0).
-    """
+    """A pinhole without distortion: focal lengths and principal point in pixels."""
 
     fx_px: Annotated[float, Gt(0)]
     fy_px: Annotated[float, Gt(0)]
@@ -131,10 +126,8 @@ class Intrinsics(NamedTuple):
 def upright(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """The rotation to z up whose y axis is where the camera looks, level; x is to the right.
 
-    Of a camera that looks straight down or up, y is up in the picture or down in it.
-
-    Args:
-        up: in camera coordinates, any length.
+    Of a camera that looks straight down or up, y is up in the picture or down in it. `up` is in
+    camera coordinates, of any length.
     """
     z = np.asarray(up, dtype=np.float64) / float(np.linalg.norm(up))
     forward = np.array([0.0, 0.0, 1.0]) - z[2] * z
@@ -195,16 +188,11 @@ def checked_mask(mask: np.ndarray, where: str) -> Int[np.ndarray, "h w"]:
     return numbers
 
 
-def read_intrinsics(words: str, folder: Path | None = None) -> Intrinsics:
-    """From "fx,fy,cx,cy" or a file.
-
-    Args:
-        words: numbers, or a path.
-        folder: that a path is relative to.
-    """
+def read_intrinsics(words: str) -> Intrinsics:
+    """From "fx,fy,cx,cy" or a file."""
     if numbers := _numbers(words):
         return Intrinsics(camera_of(numbers, f"intrinsics={words}"))
-    path = (folder or Path()) / Path(words).expanduser()
+    path = Path(words).expanduser()
     with reading(path):
         if path.suffix.lower() == ".npy":
             matrix = np.load(path, allow_pickle=False)
@@ -215,8 +203,7 @@ def read_intrinsics(words: str, folder: Path | None = None) -> Intrinsics:
         import yaml  # type: ignore[import-untyped,unused-ignore]
 
         text = text.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
-        first = next(one for one in _DOCUMENT.split(text) if one.strip())
-        return _of_mapping(yaml.safe_load(first), str(path))
+        return _of_mapping(next(yaml.safe_load_all(text)), str(path))
 
 
 def camera_of(values: Sequence[float], where: str) -> Pinhole:
@@ -239,14 +226,11 @@ def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where
     """The camera, if it can have taken a picture of this size."""
     height, width = depth_m.shape
     camera = given.camera
-    sides = np.array([width / camera.fx_px, height / camera.fy_px])
-    fields = np.degrees(2 * np.arctan(sides / 2))
+    fields = np.degrees(2 * np.arctan([width / camera.fx_px / 2, height / camera.fy_px / 2]))
     # Strictly: at twice the size the middle is the corner of this picture.
     inside = -0.5 < camera.cx_px < width - 0.5 and -0.5 < camera.cy_px < height - 0.5
-    sized = given.size in (None, (width, height))
-    if not (
-        sized and inside and (fields >= _FIELD_DEG[0]).all() and (fields <= _FIELD_DEG[1]).all()
-    ):
+    seen = ((fields >= _FIELD_DEG[0]) & (fields <= _FIELD_DEG[1])).all()
+    if given.size not in (None, (width, height)) or not inside or not seen:
         raise DataError(
             f"{where}: a picture of {width} x {height} px does not fit {camera}, of a field of "
             f"view of {fields[0]:.1f}° x {fields[1]:.1f}°, and pictures of {given.size}: are the "
@@ -299,10 +283,8 @@ def _numbers(text: str) -> list[float]:
 def _of_mapping(given: Mapping[str, Any], where: str) -> Intrinsics:
     matrix = next((given[key] for key in _MATRICES if key in given), None)
     if isinstance(matrix, Mapping) and "data" not in matrix:
-        beside = {key: value for key, value in given.items() if key not in _MATRICES}
-        return _of_mapping({**beside, **matrix}, where)  # the size may stand within, or about it
-    if isinstance(matrix, Mapping):
-        matrix = matrix["data"]
+        others = {key: value for key, value in given.items() if key not in _MATRICES}
+        return _of_mapping({**others, **matrix}, where)  # the size may stand within, or about it
     if matrix is not None:
         values = _flat(matrix)
     else:
@@ -310,14 +292,12 @@ def _of_mapping(given: Mapping[str, Any], where: str) -> Intrinsics:
         values = [float(given[key]) for key in ("fx", "fy", *centre)]
     width, height = (given.get(s, given.get(f"image_{s}")) for s in ("width", "height"))
     size = (int(width), int(height)) if width and height else None
-    bent = next((given[key] for key in _BENT if key in given), None)
-    bent = bent.get("data") if isinstance(bent, Mapping) else bent
-    if bent is None:
-        bent = [given[key] for key in _BENT_BY_ONE if key in given]
+    bent = any(any(_flat(given[key])) for key in _BENT if key in given)
     scale = given.get("depth_scale")
-    return Intrinsics(camera_of(values, where), size, any(_flat(bent)), scale and float(scale))
+    return Intrinsics(camera_of(values, where), size, bent, scale and float(scale))
 
 
 def _flat(values: Any) -> list[float]:
-    """Numbers of a list, or of a list of lists."""
+    """Numbers of one, of a list, of a list of lists, or of the `data` of a mapping."""
+    values = values["data"] if isinstance(values, Mapping) else values
     return [float(value) for value in np.ravel(values)]

@@ -25,17 +25,14 @@ from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
-_GENERATE = ["python", "generate.py"]
-
 
 @settings
 class Domain:
     """Where a dataset is, what it is called, and what to do if it is not there.
 
     Attributes:
-        name: as on the command line, e.g. "specklenet10".
-        symbol: of the paper's tables, e.g. "S".
-        title: as in a sentence, e.g. "SpeckleNet10".
+        name, symbol, title: on the command line, in the paper's tables, and in a sentence:
+            "specklenet10", "S", "SpeckleNet10".
         path: folder of the store.
         variant: which array of the store: "points", or "points_clean" for the clean twin.
         twin_of: folder of a store that holds the same objects, and `variant` next to its clouds, if
@@ -45,16 +42,14 @@ class Domain:
         simulated: the target's reality is simulated; every output about it says so.
         gravity: the axis that points up in the store: "z"; or "none" for clouds in the frame of
             their camera, which training should not turn about z (protocol.augment.rotate_z=false).
-        unit: of the store's coordinates, "metres"; or "none" if sizes mean nothing (CAD shapes,
-            clouds that were normalised) or are not known.
+        unit: of the store's coordinates, "metres"; or "none": sizes mean nothing or are not known.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
             where the camera is the origin; None: not known.
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
         expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
-        make: the command that makes the dataset; None if only published files can give it.
-        stand_in: a command that makes something to try instead.
-        synthesis: settings of `generate.py`; not used here, and never instantiated by us.
+        make, stand_in: commands that make the dataset, if one can, and something to try instead.
+        synthesis: settings of `generate.py`, not used here.
     """
 
     name: str
@@ -116,14 +111,12 @@ class Domain:
 
     def check_scale(self, scale: str) -> None:
         """Raise ConfigError if a net cannot see the clouds at this scale (`data.scale`)."""
-        if scale != "unit_ball" and self.unit != "metres":
-            raise ConfigError(
-                f"data.scale={scale}: the clouds of domain {self.name} are not known to be in "
-                "metres; if they are, set its unit=metres"
-            )
+        lacks = "unit=metres" if scale != "unit_ball" and self.unit != "metres" else ""
         if scale == "above_floor" and self.floor_m is None:
+            lacks = lacks or "floor_m"
+        if lacks:
             raise ConfigError(
-                f"data.scale={scale}: the floor of domain {self.name} is not known; set its floor_m"
+                f"data.scale={scale}: set {lacks} of domain {self.name}, if it is known"
             )
 
     def check(self) -> None:
@@ -134,26 +127,24 @@ class Domain:
             DataError: a dataset that was made here and the published files are both there.
         """
         importer = self.importer()
-        published = importer if importer is not None and importer.is_there() else None
+        there = importer is not None and importer.is_there()
         if is_finished(self.folder):
-            if published is not None and "imported" not in read_meta(self.folder):
+            if importer and there and "imported" not in read_meta(self.folder):
                 raise DataError(
                     f"domain {self.name}: there are two datasets, one that was made here in "
-                    f"{self.folder} and the published files in {published.root}: move one away, or "
+                    f"{self.folder} and the published files in {importer.root}: move one away, or "
                     "set published=null"
                 )
-            return
-        if published is not None:
-            return
-        lines = [
-            f"domain {self.name}: {self.label} is not there. Looked for:",
-            f"  {self.folder / 'meta.yaml'}",
-            *([f"  {importer.looks_for()}"] if importer else []),
-            *([f"Where to get it: {self.how_to_get.strip()}"] if self.how_to_get else []),
-            *([f"Make it:\n  {self.make}"] if self.make else []),
-            *([f"Or make a stand-in:\n  {self.stand_in}"] if self.stand_in else []),
-        ]
-        raise MissingDataError(typed("\n".join(lines)))
+        elif not there:
+            places = [str(self.folder / "meta.yaml"), *([importer.looks_for()] if importer else [])]
+            lines = {
+                f"domain {self.name}: {self.label} is not there. Looked for": " and ".join(places),
+                "Where to get it": self.how_to_get.strip(),
+                "Make it": self.make,
+                "Or make a stand-in": self.stand_in,
+            }
+            text = "\n".join(f"{what}:\n  {how}" for what, how in lines.items() if how)
+            raise MissingDataError(typed(text))
 
     def open(self, verify: bool = True) -> PointSet:
         """Open the dataset; the first time, bring the published files into the store.
@@ -172,13 +163,9 @@ class Domain:
             self._refuse_stale(importer)
         dataset = open_pointset(self.folder, self.variant, verify=verify)
         if self.classes is not None and dataset.classes != self.names:
-            raise DataError(
-                f"{self.folder} was made with the classes {', '.join(dataset.classes)}; the config "
-                f"of domain {self.name} says {', '.join(self.names)}"
-            )
-        if "imported" in dataset.meta and (problems := self._other_counts(dataset)):
-            text = "%s does not have the published numbers of clouds: %s"
-            log.warning(text, self.label, ", ".join(problems))
+            raise DataError(f"{self.folder} has the classes {dataset.classes}, not {self.names}")
+        if "imported" in dataset.meta and (other := self._other_counts(dataset)):
+            log.warning("%s: other numbers of clouds than published: %s", self.label, other)
         return replace(dataset, floor_m=self.floor_m)
 
     def check_unpublished(self) -> None:
@@ -186,8 +173,8 @@ class Domain:
         importer = self.importer()
         if importer is not None and importer.is_there():
             raise DataError(
-                f"domain {self.name}: its published files are in {importer.root}; to make another "
-                "one here give paths.data_dir=PATH, or set domain.published=null"
+                f"domain {self.name}: its published files are in {importer.root}; give another "
+                "paths.data_dir, or domain.published=null"
             )
 
     def made_of(self, dataset: PointSet) -> MadeOf:
@@ -217,7 +204,8 @@ class Domain:
             now.update({key: imported[key] for key in ("folder", "files") if key in imported})
         if imported.get("on_error") == "stop":  # nothing was wrong, so nothing was left out
             now["on_error"] = "stop"
-        if changed := sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k)):
+        changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
+        if changed:
             was, wanted = ({key: of.get(key) for key in changed} for of in (imported, now))
             raise DataError(
                 f"{self.folder} was imported with {was}, and now it is {wanted}: delete it to "
@@ -236,26 +224,24 @@ def check_or_make(source: Domain, target: Domain, make_source: bool) -> None:
         try:
             domain.check()
         except MissingDataError as error:
-            problems[domain.name] = error
+            problems[domain.name] = str(error)
     words = shlex.split(source.make or "")
-    if make_source and [*problems] == [source.name] and words[:2] == _GENERATE:
+    if make_source and [*problems] == [source.name] and words[:2] == ["python", "generate.py"]:
         if int(os.environ.get("LOCAL_RANK", 0)) == 0:  # the first process makes it
             log.info("%s is not there and is made: %s", source.label, typed(shlex.join(words)))
             done = subprocess.run([*python_command("generate"), *words[2:]], check=False)
             if done.returncode:
                 raise Qs3Error(f"domain {source.name} could not be made ({done.returncode})")
     elif problems:
-        raise MissingDataError("\n\n".join(map(str, problems.values())))
+        raise MissingDataError("\n\n".join(problems.values()))
 
 
 def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
     """conf/domain/NAME.yaml with changes, instantiated."""
-    words = [
-        f"{key if key.startswith('paths.') else f'domain.{key}'}={value}"
-        for key, value in overrides.items()
-    ]
     from qs3.config.hydra import build
 
+    prefix = {key: "" if key.startswith("paths.") else "domain." for key in overrides}
+    words = [f"{prefix[key]}{key}={value}" for key, value in overrides.items()]
     cfg = composed(None, f"+domain={name}", "+paths=default", *words, place=f"domain={name}: ")
     domain: Domain = build(cfg.domain)
     return domain

@@ -6,7 +6,6 @@ sources.yaml, which explains its keys.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import re
@@ -15,7 +14,6 @@ import tarfile
 import zipfile
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ import yaml  # type: ignore[import-untyped,unused-ignore]
 from qs3.errors import DataError, Qs3Error
 from qs3.utils.files import make_folder, reading, sha256_file, write_json
 from qs3.utils.locks import locked
+from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
@@ -44,31 +43,31 @@ class AgreementError(Qs3Error):
     """Terms have to be accepted first; the message says which and how."""
 
 
-@dataclass(frozen=True)
+@settings
 class Part:
-    """One folder of an archive, and where it goes.
-
-    `holds` and `named` are regular expressions: for paths of files relative to the folder, of which
-    `at_least` so many must match, and for the folder's own name in the archive ("": any will do).
-    """
+    """One folder of an archive, and where it goes; sources.yaml explains the keys."""
 
     folder: str
-    holds: str
-    says: str
-    at_least: int
-    domains: tuple[str, ...]
+    layout: str
+    domains: list[str]
+    suffix: str = ""
     named: str = ""
 
+    def of_layout(self, key: str) -> Any:
+        """What the part's layout has under `key`: "holds", "says" or "at_least"."""
+        value = _FILE["layouts"][self.layout][key]
+        return value.replace("SUFFIX", self.suffix) if isinstance(value, str) else value
 
-@dataclass(frozen=True)
+
+@settings
 class Source:
     """One archive that somebody publishes; sources.yaml explains the keys."""
 
     name: str
     title: str
     terms: str
-    parts: tuple[Part, ...]
-    address: str
+    parts: list[Part]
+    address: str = ""
     drive: str = ""
     agreement: str = ""
     size: int | None = None
@@ -76,31 +75,22 @@ class Source:
     size_says: str = "not known beforehand"
 
     @property
+    def page(self) -> str:
+        """Where a browser finds it."""
+        return self.address or f"https://drive.google.com/file/d/{self.drive}/view"
+
+    @property
     def file(self) -> str:
         """Its name in the folder of downloads and on a mirror."""
         return f"{self.name}.zip" if self.drive else self.address.rpartition("/")[2]
 
     @property
-    def domains(self) -> tuple[str, ...]:
+    def domains(self) -> list[str]:
         """All that its parts are for."""
-        return tuple(domain for part in self.parts for domain in part.domains)
+        return [domain for part in self.parts for domain in part.domains]
 
 
-def _part(layout: str, domains: list[str], suffix: str = "", **more: Any) -> Part:
-    values: dict[str, Any] = {
-        key: value.replace("SUFFIX", suffix) if isinstance(value, str) else value
-        for key, value in _FILE["layouts"][layout].items()
-    }
-    return Part(domains=tuple(domains), **values, **more)
-
-
-def _source(name: str, parts: list[dict[str, Any]], **more: Any) -> Source:
-    if "drive" in more:
-        more["address"] = f"https://drive.google.com/file/d/{more['drive']}/view"
-    return Source(name=name, parts=tuple(_part(**part) for part in parts), **more)
-
-
-SOURCES = {name: _source(name, **values) for name, values in _FILE["sources"].items()}
+SOURCES = {name: Source(name=name, **values) for name, values in _FILE["sources"].items()}
 
 
 def provide(
@@ -124,12 +114,35 @@ def provide(
         text, where = _FILE["agreements"][source.agreement], f" into={into}"
         raise AgreementError(text.format(name=source.name, where=where, title=source.title))
     downloads, published = make_folder(into / "downloads"), into / "published"
-    places = {part: published / part.folder for part in source.parts}
+    places = [published / part.folder for part in source.parts]
     with locked(downloads / f".{source.name}.lock"):
-        if missing := {part: at for part, at in places.items() if not _is_in_place(at, source)}:
+        pairs = zip(source.parts, places, strict=True)
+        missing = [(part, at) for part, at in pairs if not at.exists() or not any(at.iterdir())]
+        if missing:
             path = archive or fetch(source, downloads / source.file, mirror)
-            _place(source, missing, path, root, published)
-    return list(places.values())
+            building = published / f".{source.name}.unpacking"
+            shutil.rmtree(building, ignore_errors=True)  # what a killed run left
+            try:
+                _place(source, missing, path, root, building)
+            finally:
+                shutil.rmtree(building, ignore_errors=True)
+    return places
+
+
+def _place(
+    source: Source, missing: list[tuple[Part, Path]], archive: Path, root: str, building: Path
+) -> None:
+    """Unpack into a folder next to the final ones, find the parts, and rename them into place."""
+    files = unpack(archive, building)
+    folders = [root.strip("/") or find_folder(archive, files, part) for part, _ in missing]
+    sha256 = sha256_file(archive)
+    for (_, place), found in zip(missing, folders, strict=True):
+        mark = {"source": source.name, "root": found, "sha256": sha256}
+        write_json(building / found / MARK, {**mark, "size": archive.stat().st_size})
+        make_folder(place.parent)
+        if place.is_dir():
+            place.rmdir()  # empty
+        os.rename(building / found, place)
 
 
 def fetch(source: Source, path: Path, mirror: str = "") -> Path:
@@ -137,9 +150,9 @@ def fetch(source: Source, path: Path, mirror: str = "") -> Path:
     import pooch
     import requests
 
-    url = f"{mirror.rstrip('/')}/{source.file}" if mirror else source.address
+    url = f"{mirror.rstrip('/')}/{source.file}" if mirror else source.page
     downloader = None if mirror or not source.drive else _from_drive(source.drive)
-    advice = f"open {source.address} in a browser and give the file with archive=PATH"
+    advice = f"open {source.page} in a browser and give the file with archive=PATH"
     try:
         pooch.retrieve(url, source.sha256, path.name, path.parent, downloader=downloader)
     except (requests.RequestException, ValueError) as error:  # ValueError: another hash
@@ -184,59 +197,18 @@ def unpack(archive: Path, into: Path) -> list[str]:
     return [str(p) for p in files if "__MACOSX" not in p.parts and not p.name.startswith("._")]
 
 
-def find_folder(files: Iterable[str], holds: str, named: str = "", at_least: int = 10) -> str:
+def find_folder(archive: Path, files: Iterable[str], part: Part) -> str:
     """The folder of an unpacked archive that an importer reads, however it is nested.
 
-    For `holds`, `named` and `at_least` see `Part`. `files` and the result are relative to the
-    archive's top, with slashes; "" is the top itself.
+    `files` and the result are relative to the archive's top, with slashes; "" is the top itself.
     """
-    name = rf"(?:.*/)?(?i:{named})/" if named else r"(?:.*/)?"
-    pattern = re.compile(rf"(?P<root>{name}){holds}")
+    name = rf"(?:.*/)?(?i:{part.named})/" if part.named else r"(?:.*/)?"
+    pattern = re.compile(rf"(?P<root>{name}){part.of_layout('holds')}")
     roots = Counter(found["root"] for file in files if (found := pattern.fullmatch(file)))
-    large = sorted(root for root, count in roots.items() if count >= at_least)
+    large = sorted(root for root, count in roots.items() if count >= part.of_layout("at_least"))
     if len(large) != 1:
-        raise DataError(f"folders with the wanted files: {', '.join(large) or 'none'}")
+        raise DataError(
+            f"{archive}: folders of {part.of_layout('says')}: {', '.join(large) or 'none'}, of "
+            f"{sorted({file.rpartition('/')[0] for file in files})[:12]}; take one by root=FOLDER"
+        )
     return large[0].rstrip("/")
-
-
-def _is_in_place(place: Path, source: Source) -> bool:
-    """Whether the folder is there; warns if it did not come from this source."""
-    if not place.exists() or not any(place.iterdir()):
-        return False
-    mark = place / MARK
-    origin = json.loads(mark.read_text())["source"] if mark.is_file() else "somewhere else"
-    if origin != source.name:
-        log.warning("%s is there already, from %s, and is left alone", place, origin)
-    return True
-
-
-def _place(
-    source: Source, missing: dict[Part, Path], archive: Path, root: str, published: Path
-) -> None:
-    """Unpack into a folder next to the final ones, find the parts, and rename them into place."""
-    building = published / f".{source.name}.unpacking"
-    shutil.rmtree(building, ignore_errors=True)  # what a killed run left
-    sha256 = sha256_file(archive)
-    log.info("%s: SHA-256 %s", archive, sha256)
-    try:
-        files, found = unpack(archive, building), {}
-        for part in missing:
-            try:
-                found[part] = root.strip("/") or find_folder(
-                    files, part.holds, part.named, part.at_least
-                )
-            except DataError as error:
-                raise DataError(
-                    f"{archive}: {error}. Wanted is {part.says}; take a folder with root=FOLDER, "
-                    f"of {sorted({file.rpartition('/')[0] for file in files})[:12]}"
-                ) from error
-        for part, place in missing.items():
-            folder = building / found[part]
-            mark = {"source": source.name, "root": found[part], "sha256": sha256}
-            write_json(folder / MARK, {**mark, "size": archive.stat().st_size})
-            make_folder(place.parent)
-            if place.is_dir():
-                place.rmdir()  # empty, see `_is_in_place`
-            os.rename(folder, place)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)

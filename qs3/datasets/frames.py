@@ -23,9 +23,8 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Float
 
-from qs3.datasets.cutting import Piece
+from qs3.datasets.cutting import Piece, Rules
 from qs3.datasets.importing import Importer, Item, check_cloud, report, thinned
-from qs3.datasets.regions import Rules
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.store.manifest import OK, SPLITS, ManifestRow
 from qs3.store.parts import PartFiles
@@ -40,41 +39,39 @@ log = logging.getLogger(__name__)
 COLUMNS = ("frame", "sensor", "sub", "tier", "why", "holes", "rim", "occ", "depth_m", "vertical")
 """Further columns of the manifest."""
 
-_DIED = "the process died on it each time (out of memory, or a crash)"
-
 Part = tuple[dict[str, Any], dict[str, np.ndarray]]
 """The note and the arrays of a finished part."""
 
 
 @dataclass(frozen=True)
 class FrameTask:
-    """One frame to cut, before it is read.
+    """One frame, or one scene, to cut, before it is read.
 
     Attributes:
-        number: in the dataset, from 1.
+        name: of its part.
+        stem: of its objects' ids; "_" parts what is not independent of it from the rest.
         split: "train" or "test".
-        cluster: what is not independent of it: its room, or the block of frames it is one of.
+        number: in the dataset.
         sensor: that took it.
         vertical: how its vertical was found.
-        world_from_camera: `[3][3]` rotation to z up; None if the reader knows it.
+        known: what the reader found out beforehand.
     """
 
-    number: int
+    name: str
+    stem: str
     split: str
-    cluster: str
+    number: int
     sensor: str
     vertical: str
-    world_from_camera: Sequence[Sequence[float]] | None = None
+    known: Any = None
 
-    @property
-    def name(self) -> str:
-        """Of its part."""
-        return f"{self.number:06d}"
 
-    @property
-    def stem(self) -> str:
-        """Of its objects' ids."""
-        return f"{self.cluster}_{self.number:05d}"
+def frame_task(
+    number: int, split: str, cluster: str, sensor: str, vertical: str, known: Any = None
+) -> FrameTask:
+    """A frame, counted from 1; `cluster` is its room, or the block of frames it is one of."""
+    stem = f"{cluster}_{number:05d}"
+    return FrameTask(f"{number:06d}", stem, split, number, sensor, vertical, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,10 +111,6 @@ class CutDataset(Importer):
     workers: Annotated[int, Ge(0)] = 0
 
     @abc.abstractmethod
-    def files(self) -> Sequence[Path]:
-        """What is read at once; a change of them is noticed."""
-
-    @abc.abstractmethod
     def tasks(self) -> list[FrameTask]:
         """The frames of the official splits, in the dataset's order; DataError if damaged."""
 
@@ -125,20 +118,12 @@ class CutDataset(Importer):
     def cutter(self) -> Cutter:
         """What cuts a frame; made once in each process, it may keep files open."""
 
-    def looks_for(self) -> str:
-        """See `Importer`."""
-        return " and ".join(map(str, self.files()))
-
-    def is_there(self) -> bool:
-        """See `Importer`."""
-        return all(path.is_file() for path in self.files())
-
     def items(self, classes: Sequence[str]) -> list[Item]:
         """None: frames are cut, not listed."""
         return []
 
     def object_of(self, id_: str) -> str:
-        """See `Importer`: the room, or the block of frames; things in one room are not independent.
+        """See `Importer`: the room, or the block of frames.
 
         It is what stands before the frame and the object's number in the last part of an id.
         """
@@ -163,7 +148,7 @@ class CutDataset(Importer):
         make = functools.partial(_worker, self)
         with progress_bar(f"cutting objects from {self.root.name}", total=len(todo)) as advance:
             for outcome in Processes(self.workers).run(make, todo) if todo else ():
-                result = outcome.result or f"{outcome.name}: {_DIED}"
+                result = outcome.result or f"{outcome.name}: its process died (out of memory?)"
                 if not isinstance(result, str):
                     parts.write(outcome.name, *result)
                 elif self.on_error == "stop":
@@ -188,13 +173,12 @@ class CutDataset(Importer):
             **{name: version(name) for name in ("scipy", "fpsample")},
         }
         recipe, parts = {"settings": self.settings(), "versions": versions}, PartFiles(work)
-        if parts.have_recipe:
-            try:
-                parts.check(recipe)
-            except Qs3Error:
-                log.info("settings, files or versions have changed: the frames are cut anew")
-                shutil.rmtree(work)
-        parts.begin(recipe)
+        try:
+            parts.begin(recipe)
+        except Qs3Error:
+            log.info("settings, files or versions have changed: the frames are cut anew")
+            shutil.rmtree(work)
+            parts.begin(recipe)
         return parts
 
     def _of_task(
@@ -202,8 +186,8 @@ class CutDataset(Importer):
     ) -> Iterator[tuple[ManifestRow, np.ndarray | None]]:
         """Rows of one frame's objects with their clouds."""
         more = {"frame": str(task.number), "sensor": task.sensor, "vertical": task.vertical}
-        if why := failed.get(task.name, ""):
-            id_ = f"{task.split}/{task.stem}"
+        if task.name in failed:
+            id_, why = f"{task.split}/{task.stem}", failed[task.name]
             yield ManifestRow(id_, "", task.split, status="skipped", reason=why, more=more), None
             return
         note, arrays = parts.read(task.name)
@@ -229,7 +213,7 @@ class FrameDataset(CutDataset):
 
     Attributes:
         names: name in the dataset -> class; names that are not in it are left alone.
-        rules: as `qs3.datasets.regions.Rules`.
+        rules: as `qs3.datasets.cutting.Rules`.
         tiers: which of "clean" and "hard" become clouds.
         block: so many frames in a row make a cluster, where rooms are not known.
     """

@@ -34,8 +34,6 @@ from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
-_SHOWN = 5  # reasons, in the log
-
 UpAxis = Literal["z", "-z", "y", "-y", "x", "-x"]
 UP_AXES: tuple[str, ...] = get_args(UpAxis)
 """The axes of a file that may point up."""
@@ -54,13 +52,11 @@ _TURNS = {
 class Item(NamedTuple):
     """One published cloud before it is read: its row, as far as it is known.
 
-    `where` names it in messages (file, or file and number); `load` gives the raw [n, 3] array or
-    raises DataError. A row that knows its `valid_points` keeps them: the array is of a cloud that
-    was thinned before.
+    `load` gives the raw [n, 3] array or raises DataError. A row that knows its `valid_points` keeps
+    them: the array is of a cloud that was thinned before.
     """
 
     row: ManifestRow
-    where: str
     load: Callable[[], np.ndarray]
 
 
@@ -70,10 +66,9 @@ class Importer(abc.ABC):
 
     Attributes:
         folder: where its files are.
-        points: P, the points a cloud has as published. A cloud with fewer is filled up by
-            repeating its points from the first on; the manifest's `valid_points` says how many
-            there were. One with more is an error: it is not the dataset that was meant.
-        on_error: "stop" at a damaged cloud, or "skip" it and say so in the manifest.
+        points: P, the points a cloud has as published. One with fewer repeats its points from the
+            first on; the manifest's `valid_points` has how many there were.
+        on_error: "stop" at a damaged cloud, or "skip" it with the reason in the manifest.
     """
 
     folder: Path
@@ -83,6 +78,9 @@ class Importer(abc.ABC):
     recorded: ClassVar[str] = "imported"
     """The key of the settings in the store's meta.yaml."""
 
+    holds: ClassVar[str] = ""
+    """A pattern of what is read, below the folder, where `files` does not name it."""
+
     thins: ClassVar[bool] = False
     """Whether larger clouds become their farthest points; else they are an error."""
 
@@ -91,13 +89,20 @@ class Importer(abc.ABC):
         """The folder as an absolute path."""
         return Path(os.path.expanduser(self.folder)).absolute()
 
-    @abc.abstractmethod
-    def looks_for(self) -> str:
-        """The files it reads, as a pattern with the whole path, for a message."""
+    def files(self) -> Sequence[Path]:
+        """The files that are read, all of which must be there."""
+        return ()
 
-    @abc.abstractmethod
+    def looks_for(self) -> str:
+        """What it reads, with the whole path, for a message."""
+        return " and ".join(map(str, self.files())) or f"{self.root}/{self.holds}"
+
     def is_there(self) -> bool:
         """Whether there is anything to read; must be fast."""
+        files = self.files()
+        if files or not self.holds:
+            return bool(files) and all(map(Path.is_file, files))
+        return any(self.root.glob(self.holds))
 
     @abc.abstractmethod
     def items(self, classes: Sequence[str]) -> list[Item]:
@@ -114,8 +119,7 @@ class Importer(abc.ABC):
     def object_of(self, id_: str) -> str:
         """Which object a cloud shows, where its id tells; else "".
 
-        Clouds of one object are not independent samples: `qs3.report.intervals` takes them
-        together.
+        `qs3.report.intervals` takes clouds of one object together: they are not independent.
         """
         return ""
 
@@ -130,15 +134,15 @@ class Importer(abc.ABC):
 
         Args:
             classes: the names in label order.
-            work: a folder in which an importer that takes minutes may keep what it has done, to
-                continue after an interruption; it is deleted when the store is finished.
+            work: a folder for what an importer that takes minutes has done, to continue after an
+                interruption; it is deleted when the store is finished.
         """
         clouds, rows = [], []
-        for row, where, load in shown(self.items(classes), f"importing {self.root.name}"):
+        for row, load in shown(self.items(classes), f"importing {self.root.name}"):
             try:
                 raw = load()
                 cloud = thinned(raw, self.points) if self.thins else raw
-                cloud = check_cloud(cloud, self.points, where)
+                cloud = check_cloud(cloud, self.points, f"{self.root}/{row.origin}")
             except DataError as error:
                 if self.on_error == "stop":
                     raise
@@ -158,14 +162,13 @@ class Importer(abc.ABC):
         """Plain values that decide what `read` gives; kept in the store's meta.yaml."""
         values = {"format": type(self).__name__, **dataclasses.asdict(self)}
         plain: dict[str, Any] = json.loads(json.dumps({**values, "folder": str(self.root)}))
-        stats = [
-            (os.path.relpath(path, self.root), path.stat())
-            for path in self.watched()
-            if path.is_file()
+        there = [path for path in self.watched() if path.is_file()]
+        seen = [
+            (os.path.relpath(path, self.root), path.stat().st_size, path.stat().st_mtime_ns)
+            for path in there
         ]
-        if stats:
-            seen = repr([(name, one.st_size, one.st_mtime_ns) for name, one in stats])
-            plain["files"] = hashlib.sha256(seen.encode()).hexdigest()
+        if seen:
+            plain["files"] = hashlib.sha256(repr(seen).encode()).hexdigest()
         return plain
 
 
@@ -219,17 +222,7 @@ def file_item(
     """The one cloud of a file below `root`; its name is that of the file unless given."""
     id_ = cloud_id(cls, split, name or path.stem)
     row = ManifestRow(id_, cls, split, origin=path.relative_to(root).as_posix())
-    return Item(row, str(path), functools.partial(load, path))
-
-
-def unique(items: Iterable[Item]) -> list[Item]:
-    """The items themselves, if their ids differ by more than case: not all systems tell it."""
-    found: dict[str, Item] = {}
-    for item in items:
-        other = found.setdefault(item.row.id.casefold(), item)
-        if other is not item:
-            raise DataError(f"{item.where} and {other.where} have one name; rename one")
-    return list(found.values())
+    return Item(row, functools.partial(load, path))
 
 
 def by_class(items: Iterable[Item], classes: Sequence[str]) -> list[Item]:
@@ -299,7 +292,7 @@ def turned(cloud: Float[np.ndarray, "*b 3"], up: str) -> Float[np.ndarray, "*b 3
 
 
 def report(rows: Sequence[ManifestRow], classes: Sequence[str], points: int, where: Path) -> None:
-    """Log what is missing, filled up or left out: never silently. DataError if nothing is there."""
+    """Warn of what is missing, filled up or left out. DataError if nothing is there."""
     kept = [row for row in rows if row.status == "ok"]
     if not kept:
         raise DataError(f"{where} holds no clouds that can be read")
@@ -309,8 +302,6 @@ def report(rows: Sequence[ManifestRow], classes: Sequence[str], points: int, whe
             log.warning("%s: split %r has no clouds of %s", where, split, ", ".join(empty))
     if short := sum((row.valid_points or points) < points for row in kept):
         log.warning("%s: clouds under %d points, some repeated: %d", where, points, short)
-    skipped = [row for row in rows if row.status != "ok"]
-    for row in skipped[:_SHOWN]:
-        log.warning("left out: %s", row.reason)
-    if skipped:
-        log.warning("%s: clouds left out: %d; manifest.csv says why", where, len(skipped))
+    if len(kept) < len(rows):
+        text = "%s: clouds left out: %d; manifest.csv says why"
+        log.warning(text, where, len(rows) - len(kept))

@@ -21,8 +21,8 @@ import numpy as np
 from qs3.datasets.importing import Importer, Item, by_class
 from qs3.errors import DataError
 from qs3.store.manifest import OK, read_manifest
-from qs3.store.meta import MadeOf
-from qs3.store.store import PointSet, is_finished, open_pointset
+from qs3.store.meta import META, MadeOf
+from qs3.store.store import open_pointset
 from qs3.utils.settings import settings
 
 _FURTHER_SCAN = re.compile(r"~\d+$")
@@ -46,13 +46,9 @@ class Joined(Importer):
         """The datasets' folders."""
         return [self.root / name for name in self.datasets]
 
-    def looks_for(self) -> str:
+    def files(self) -> list[Path]:
         """See `Importer`."""
-        return f"{self.root}: {' '.join(self.datasets)}   (published.datasets=[A,B])"
-
-    def is_there(self) -> bool:
-        """See `Importer`: all of them are finished."""
-        return bool(self.stores) and all(map(is_finished, self.stores))
+        return [folder / META for folder in self.stores]
 
     def made_of(self) -> MadeOf:
         """See `Importer`: what differs among the datasets is listed."""
@@ -95,11 +91,7 @@ class Joined(Importer):
                     index=None,
                     more={**row.more, DATASET: name},
                 )
-                load = functools.partial(_measured, data, i, row.valid_points)
-                found.append(Item(row, f"{folder}, cloud {i} ({row.id})", load))
+                # Without the repetitions by which a small cloud was filled up.
+                load = functools.partial(np.asarray, data.points[i][: row.valid_points])
+                found.append(Item(row, load))
         return by_class(found, classes)
-
-
-def _measured(data: PointSet, cloud: int, valid_points: int | None) -> np.ndarray:
-    """[n, 3] without the repetitions by which a small cloud was filled up."""
-    return np.asarray(data.points[cloud][:valid_points])

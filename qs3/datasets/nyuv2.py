@@ -36,7 +36,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.datasets.cutting import cut
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
-from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, load_mat
+from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, frame_task, load_mat
 from qs3.datasets.vertical import floor_up, planes_up
 from qs3.errors import DataError
 from qs3.store.meta import MadeOf
@@ -52,12 +52,11 @@ CAMERA = Pinhole(518.857901, 519.469611, 325.582449 - 1, 253.736166 - 1)
 AREA = (44, 471, 40, 601)
 """Rows from, to and columns from, to of the depth that was projected; of pictures of 640 x 480."""
 
-_SIZE = (480, 640)
 _FARTHEST_M = 9.99
 
 
 class LabelledFrames:
-    """The open .mat; a context manager.
+    """The open .mat; a context manager. Images are read when they are asked for.
 
     Attributes:
         path: of the file.
@@ -66,7 +65,6 @@ class LabelledFrames:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file; images are read when they are asked for."""
         import h5py
 
         self.path = path
@@ -91,7 +89,7 @@ class LabelledFrames:
     @property
     def area(self) -> tuple[int, int, int, int] | None:
         """Where depth was projected to; None if the pictures have not the published size."""
-        return AREA if tuple(self._shape[::-1]) == _SIZE else None
+        return AREA if self._shape == [640, 480] else None
 
     def depth_m(self, frame: int) -> Float[np.ndarray, "h w"]:
         """[h, w] float64, 0 where nothing was measured (the toolbox cuts depths off at 10 m)."""
@@ -169,8 +167,7 @@ class NYUv2(FrameDataset):
                 if up is None:
                     lost.append(i + 1)
                     continue
-                turn = upright(up).tolist()
-                found.append(FrameTask(i + 1, splits[i], room, "kinect_v1", way, turn))
+                found.append(frame_task(i + 1, splits[i], room, "kinect_v1", way, upright(up)))
         if lost:
             log.warning("%s: frames without a vertical are left out: %s", self.root, lost)
         return found
@@ -181,8 +178,7 @@ class NYUv2(FrameDataset):
 
         def cut_frame(task: FrameTask) -> list[Cut]:
             index = task.number - 1
-            turn = np.array(task.world_from_camera)
-            image = DepthImage(frames.depth_m(index), CAMERA, turn, frames.area)
+            image = DepthImage(frames.depth_m(index), CAMERA, task.known, frames.area)
             labels, instances = frames.labels(index), frames.instances(index)
             cuts = []
             for number in np.unique(labels[labels > 0]).tolist():
@@ -218,7 +214,7 @@ class NYUv2(FrameDataset):
 
 
 def _vertical(frames: LabelledFrames, frame: int) -> tuple[str, np.ndarray | None]:
-    """How the vertical of a frame was found, and up in its camera; see `qs3.datasets.vertical`."""
+    """How the vertical of a frame was found, and up in its camera."""
     depth_m, floor = frames.depth_m(frame), np.zeros(0, bool)
     if "floor" in frames.names:
         floor = frames.labels(frame) == frames.names.index("floor") + 1

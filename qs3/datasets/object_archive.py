@@ -24,7 +24,7 @@ import hashlib
 import logging
 import zipfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -61,6 +61,7 @@ class Archive:
         cls, sub, tier, dev: [N] text; `sub` is `cls` and `dev` empty where the file has none.
         frame: [N] number of the frame.
         pixels, rim, occ: [N]; None where the file has none.
+        arrays: the points and where they begin.
     """
 
     path: Path
@@ -72,10 +73,7 @@ class Archive:
     pixels: np.ndarray | None
     rim: np.ndarray | None
     occ: np.ndarray | None
-    _tenths: np.ndarray
-    _centre: np.ndarray
-    _start: np.ndarray
-    _inlier: np.ndarray | None
+    arrays: Mapping[str, np.ndarray]
 
     def __len__(self) -> int:
         """N."""
@@ -94,14 +92,16 @@ class Archive:
 
     def size(self, index: int) -> int:
         """Points of an object, stray ones too."""
-        return int(self._start[index + 1] - self._start[index])
+        start = self.arrays["start"]
+        return int(start[index + 1] - start[index])
 
     def cloud(self, index: int, inliers_only: bool) -> Float[np.ndarray, "n 3"]:
         """[n, 3] float32 metres, z up, the camera at the origin."""
-        part = slice(self._start[index], self._start[index + 1])
-        xyz = self._tenths[part] * _METRES + self._centre[index].astype(np.float64)
-        if inliers_only and self._inlier is not None:
-            kept = self._inlier[part]
+        part = slice(*self.arrays["start"][index : index + 2])
+        centre = self.arrays["centre_m"][index].astype(np.float64)
+        xyz = self.arrays["xyz_tenth_mm"][part] * _METRES + centre
+        if inliers_only and "inlier" in self.arrays:
+            kept = self.arrays["inlier"][part]
             xyz = xyz[kept] if kept.any() else xyz
         return np.asarray(xyz, dtype=np.float32)
 
@@ -131,7 +131,6 @@ class ObjectArchive(Importer):
     block: Annotated[int, Ge(1)] = 30
     inliers_only: bool = True
     tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: ["clean", "hard"])
-
     thins: ClassVar[bool] = True
 
     @property
@@ -150,13 +149,9 @@ class ObjectArchive(Importer):
         parts = ", ".join(self.test_parts)
         return f"part {parts} of {self.path.name} (all of it, if it has no parts)"
 
-    def looks_for(self) -> str:
+    def files(self) -> list[Path]:
         """See `Importer`."""
-        return f"{self.path}   (arrays {', '.join(_REQUIRED)}; published.file=PATH)"
-
-    def is_there(self) -> bool:
-        """See `Importer`."""
-        return self.path.is_file()
+        return [self.path]
 
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`; reads the file. Sorted by split, class and id."""
@@ -164,19 +159,16 @@ class ObjectArchive(Importer):
         splits = self._splits(archive)
         found, left = [], Counter[str]()
         for i in range(len(archive)):
-            where = f"{archive.path}, object {i}"
-            cls = class_of(str(archive.cls[i]), classes, where)
-            split = splits[i]
-            if not split or archive.tier[i] not in self.tiers:
-                left[str(archive.tier[i] if split else archive.dev[i])] += 1
+            cls = class_of(str(archive.cls[i]), classes, f"{archive.path}, object {i}")
+            split, tier, frame = splits[i], str(archive.tier[i]), int(archive.frame[i])
+            if not split or tier not in self.tiers:
+                left[tier if split else str(archive.dev[i])] += 1
                 continue
-            frame = int(archive.frame[i])
             name = f"block{frame // self.block:04d}_{frame:05d}_{i}"
-            more = {"frame": str(frame), "sub": str(archive.sub[i]), "tier": str(archive.tier[i])}
+            more = {"frame": str(frame), "sub": str(archive.sub[i]), "tier": tier}
             origin = f"{self.path.name}[{i}]"
             row = ManifestRow(f"{cls}/{split}/{name}", cls, split, None, "", origin, 1, more=more)
-            load = functools.partial(archive.cloud, i, self.inliers_only)
-            found.append(Item(row, where, load))
+            found.append(Item(row, functools.partial(archive.cloud, i, self.inliers_only)))
         if left:
             log.info("%s: objects left out: %s", self.path, dict(sorted(left.items())))
         return by_class(found, classes)
@@ -227,18 +219,13 @@ def read_archive(path: Path) -> Archive:
         assert {*found["tier"].tolist()} <= {*TIERS}, "tier is not clean or hard"
     return Archive(
         path,
-        found["cls"],
-        found.get("sub", found["cls"]),
-        found["tier"],
-        found.get("dev", np.full(n, "")),
-        found["img"].astype(np.int64),
-        found.get("pixels"),
-        found.get("rim"),
-        found.get("occ"),
-        found["xyz_tenth_mm"],
-        found["centre_m"],
-        start,
-        found.get("inlier"),
+        cls=found["cls"],
+        sub=found.get("sub", found["cls"]),
+        tier=found["tier"],
+        dev=found.get("dev", np.full(n, "")),
+        frame=found["img"].astype(np.int64),
+        **{key: found.get(key) for key in ("pixels", "rim", "occ")},
+        arrays={**found, "start": start},
     )
 
 

@@ -3,7 +3,7 @@
     objects = point_out(depth_m, camera, mask=mask)          # one a number of the mask
     objects = point_out(depth_m, camera, box=(210, 95, 480, 430), up=(0, -0.97, -0.24))
 
-The rules for objects of datasets (`qs3.datasets.regions.Rules`) do not refuse here, they caution:
+The rules for objects of datasets (`qs3.datasets.cutting.Rules`) do not refuse here, they caution:
 who points at a thing wants to know what it is. A thing without any depth in its pixels is an error.
 
 Of a box, the object is what lies in it and not on the plane it stands on, and of that the pieces
@@ -19,9 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.datasets.cutting import CLEAN, HARD, Fault, Piece, cut_out, faults
+from qs3.datasets.cutting import CLEAN, HARD, Piece, Rules, body, cut_out, faults, pieces
 from qs3.datasets.depth_images import CAMERA_UP, DepthImage, Pinhole, checked_mask, upright
-from qs3.datasets.regions import Rules, body, pieces
 from qs3.datasets.vertical import angle_deg, planes_up_steep
 from qs3.errors import DataError
 
@@ -32,18 +31,18 @@ POOR = "poor"
 """The tier of what the importers of datasets would leave out."""
 
 GIVEN, PLANES, LEVEL = "given", "planes", "level"
-"""How up is known: told, fitted to the planes of the picture, or up in the picture."""
+"""How up is known: given, fitted to the planes of the picture, or up in the picture."""
 
 BOX = "box"
 """The kind of caution of a box that does not part its object from what is around it."""
 
-_MOST_TILT_DEG = 90.0  # of an up that is told: beyond, it is down
-_MOST_OFF_DEG = 20.0  # from an up that is told to that of the planes
+_MOST_TILT_DEG = 90.0  # of an up that is given: beyond, it is down
+_MOST_OFF_DEG = 20.0  # from an up that is given to that of the planes
 _AROUND = 0.25  # of a box's sides, looked at around it
 _AROUND_PX = 12  # at least
 _BIN_M = 0.02
 _LEVEL_M = 0.06  # so far from the commonest height a point may be the support's
-_LEAST_SUPPORT = 0.15  # share of the points beside and below a box that a support has
+_LEAST_SUPPORT = 0.15  # share of the points next to and below a box that a support has
 _LEAST_PX = 60
 _OWN = 0.6  # share of a piece that must lie within the box for it not to be background
 _JOIN = 0.2  # of the size of a box's largest piece: what is so near is of the same object
@@ -52,12 +51,7 @@ _STEEPEST = np.cos(np.deg2rad(20.0))  # of a support
 
 
 class Caution(NamedTuple):
-    """Why a prediction may be wrong, though it was made.
-
-    Attributes:
-        kind: in a word or two, to count them by.
-        words: with the figure.
-    """
+    """Why a prediction may be wrong, though it was made: in a word or two, and with the figure."""
 
     kind: str
     words: str
@@ -104,7 +98,6 @@ def point_out(
     mask: Int[np.ndarray, "h w"] | Bool[np.ndarray, "h w"] | None = None,
     box: Sequence[float] | None = None,
     up: Sequence[float] | None = None,
-    only: int | None = None,
 ) -> list[Pointed]:
     """The objects of a mask, by their numbers, or the one of a box.
 
@@ -115,7 +108,6 @@ def point_out(
         box: left, top, right, bottom in pixels; what lies beyond the picture is cut off.
         up: direction in camera coordinates (x right, y down, z forward) of any length; None: by
             the planes of the picture, and if it has none up in the picture.
-        only: of the mask, the object of this number alone.
     """
     assert (mask is None) != (box is None), "a depth image takes a mask or a box, and not both"
     way, how, unsure = _vertical(DepthImage(depth_m, camera, np.eye(3)), up)
@@ -126,21 +118,15 @@ def point_out(
         name = "[" + ",".join(f"{value:g}" for value in box) + "]"
         if not found.any():
             found[sides[0] : sides[1], sides[2] : sides[3]] = True  # as pointed at
-            if (found & _in_range(image.depth_m, RULES)).any():
-                why = "all of its pixels with depth belong to the plane it stands on; give a mask"
-                return [_judged(name, image, found, 0, how, (), why)]
         return [_judged(name, image, found, 0, how, (*unsure, *odd))]
     assert mask is not None
     numbers = checked_mask(np.asarray(mask), "the mask")
     if numbers.shape != image.depth_m.shape:
         raise DataError(f"the mask is {numbers.shape}, the depth image {image.depth_m.shape}")
-    wanted = [int(n) for n in np.unique(numbers) if n and only in (None, n)]
-    if not wanted:
-        raise DataError(f"the mask has no object {only}")
     single = np.asarray(mask).dtype.kind == "b"
     return [
         _judged("" if single else f"[{n}]", image, numbers == n, RULES.erode_px, how, unsure)
-        for n in wanted
+        for n in np.unique(numbers[numbers != 0]).tolist()
     ]
 
 
@@ -151,62 +137,52 @@ def _judged(
     edge_px: int,
     how: str,
     unsure: Sequence[Caution],
-    why: str = "",
 ) -> Pointed:
-    """`why`: it cannot be used, whatever is measured there; "" otherwise."""
-    piece = cut_out(image, np.zeros_like(mask) if why else mask, RULES, edge_px)
+    piece = cut_out(image, mask, RULES, edge_px)
     if not piece.pixels and edge_px:  # so thin that nothing else is there
         piece = cut_out(image, mask, RULES, 0)
     without, turn = int((mask & (image.depth_m <= 0)).sum()), image.world_from_camera
     if not piece.pixels:
-        near, far = RULES.near_m, RULES.far_m
-        some = (mask & (image.depth_m > 0)).any()
-        range_ = f" from {near:g} to {far:g} m" if some else ""
-        why = why or f"none of its {int(mask.sum())} pixels has depth{range_}"
+        why = f"none of its {int(mask.sum())} pixels has depth"
+        if (mask & (image.depth_m > 0)).any():
+            why += f" from {RULES.near_m:g} to {RULES.far_m:g} m"
         return Pointed(name, piece, mask, without, POOR, (), how, turn, why)
     found = faults(piece, "", RULES)
-    tier = tier_of(found)
-    if tier == CLEAN and any(caution.kind == BOX for caution in unsure):
-        tier = HARD
+    refused = any(fault.refuses for fault in found)  # by the importers of datasets
+    boxed = any(caution.kind == BOX for caution in unsure)
+    tier = POOR if refused else HARD if found or boxed else CLEAN
     cautions = (*(Caution(fault.kind, fault.words) for fault in found), *unsure)
     return Pointed(name, piece, mask, without, tier, cautions, how, turn)
-
-
-def tier_of(found: Sequence[Fault]) -> str:
-    """Clean without faults, poor if one of them would leave it out of a dataset, else hard."""
-    return POOR if any(fault.refuses for fault in found) else HARD if found else CLEAN
 
 
 def _vertical(
     image: DepthImage, up: Sequence[float] | None
 ) -> tuple[np.ndarray, str, tuple[Caution, ...]]:
     """Up in camera coordinates, how it is known, and what is not sure about it."""
+    fitted, sure = planes_up_steep(image.depth_m, image.camera)
+    words = ""
     if up is not None:
-        way = np.asarray(up, dtype=np.float64)
+        way, how = np.asarray(up, dtype=np.float64), GIVEN
         length = float(np.linalg.norm(way))
         if way.shape != (3,) or not np.isfinite(length) or length < 1e-9:
             raise DataError(f"up={list(up)} is not a direction x,y,z in the camera's frame")
         tilt = angle_deg(way / length, CAMERA_UP)
-        words = f"up points {tilt:.0f}° away from up in the picture; a level camera has up=0,-1,0"
+        off = 0.0 if fitted is None or not sure else angle_deg(fitted, way / length)
         if tilt > _MOST_TILT_DEG:
-            return way, GIVEN, (Caution("up", words),)
-        return way, GIVEN, _against_planes(image, way / length)
-    fitted, sure = planes_up_steep(image.depth_m, image.camera)
-    if fitted is not None:
-        words = "the planes of the picture leave open what is level; give up=x,y,z"
-        return fitted, PLANES, () if sure else (Caution("up", words),)
-    words = "up is not known: the picture shows no planes, so the camera counts as level"
-    return CAMERA_UP, LEVEL, (Caution("up", words),)
-
-
-def _against_planes(image: DepthImage, up: np.ndarray) -> tuple[Caution, ...]:
-    """A caution if the picture has level planes, and they lie otherwise than by the unit `up`."""
-    fitted, sure = planes_up_steep(image.depth_m, image.camera)
-    if fitted is None or not sure or (off := angle_deg(fitted, up)) <= _MOST_OFF_DEG:
-        return ()
-    shown = ",".join(f"{value:.2f}" for value in fitted)
-    words = f"the planes of the picture say up={shown}, {off:.0f}° from what is given"
-    return (Caution("up", words),)
+            words = (
+                f"up points {tilt:.0f}° away from up in the picture; a level camera has up=0,-1,0"
+            )
+        elif fitted is not None and off > _MOST_OFF_DEG:
+            shown = ",".join(f"{value:.2f}" for value in fitted)
+            words = f"by the planes of the picture up={shown}, {off:.0f}° from what is given"
+    elif fitted is not None:
+        way, how = fitted, PLANES
+        if not sure:
+            words = "the planes of the picture leave open what is level; give up=x,y,z"
+    else:
+        way, how = CAMERA_UP, LEVEL
+        words = "up is not known: the picture shows no planes, so the camera counts as level"
+    return way, how, (Caution("up", words),) if words else ()
 
 
 def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, int]:
@@ -223,11 +199,11 @@ def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, i
 
 
 def in_box(
-    image: DepthImage, sides: tuple[int, int, int, int], rules: Rules = RULES
+    image: DepthImage, sides: tuple[int, int, int, int]
 ) -> tuple[Bool[np.ndarray, "h w"], tuple[Caution, ...]]:
     """The pixels of a box's object, and cautions.
 
-    What the object stands on is the plane, within 20° of level, that most points beside and below
+    What the object stands on is the plane, within 20° of level, that most points next to and below
     the box lie on; its points and those beneath go. What is left, in the box and around it, is
     parted where the depth jumps: of the pieces that lie within the box the one that is largest and
     fills it best is the object, with those near it.
@@ -235,7 +211,6 @@ def in_box(
     Args:
         image: with z up.
         sides: rows from, to and columns from, to.
-        rules: see there.
     """
     top, bottom, left, right = sides
     height, width = image.depth_m.shape
@@ -248,19 +223,19 @@ def in_box(
     inner = np.zeros(image.depth_m.shape, dtype=bool)
     inner[top:bottom, left:right] = True
     depth, points, inside = image.depth_m[at], image.points_m[at], inner[at]
-    measured = _in_range(depth, rules)
+    measured = (depth >= RULES.near_m) & (depth <= RULES.far_m)
     low = np.zeros_like(inside)
     low[top - at[0].start + 2 * (bottom - top) // 3 :] = True
     height_m = _above_support(points, measured & low & ~inside)
-    above = np.maximum(rules.floor_m, rules.floor_share * depth)
+    above = np.maximum(RULES.floor_m, RULES.floor_share * depth)
     left_over = measured if height_m is None else measured & (height_m > above)
-    number = pieces(left_over, depth, rules)
     result = np.zeros_like(inner)
-    if not (number >= 0).any():
+    if not (left_over & inside).any():
         result[at] = inside & measured
         return result, (Caution(BOX, "all in the box is the plane that things stand on"),)
-    everywhere = np.bincount(number[number >= 0])
-    within = np.bincount(number[inside & (number >= 0)], minlength=len(everywhere))
+    number = pieces(left_over, depth, RULES)
+    everywhere = np.bincount(number[left_over])
+    within = np.bincount(number[inside & left_over], minlength=len(everywhere))
     own = within >= np.maximum(_OWN * everywhere, 1)
     if (within * own).max() < max(0.05 * within.max(), _LEAST_PX):
         result[at] = inside & left_over
@@ -273,19 +248,12 @@ def in_box(
     order = np.argsort(-fits, kind="stable")
     number[number >= 0] = np.argsort(order)[number[number >= 0]]  # the best is 0
     size = float(np.ptp(points[number == 0], axis=0).max())
-    near = replace(rules, join_m=min(rules.join_m, _JOIN * size))
-    result[at] = body(number, points, near)
+    result[at] = body(number, points, replace(RULES, join_m=min(RULES.join_m, _JOIN * size)))
     return result, ()
-
-
-def _in_range(depth_m: Float[np.ndarray, "h w"], rules: Rules) -> Bool[np.ndarray, "h w"]:
-    return (depth_m >= rules.near_m) & (depth_m <= rules.far_m)
 
 
 def _fit(piece: Bool[np.ndarray, "h w"], box: Bool[np.ndarray, "h w"]) -> float:
     """Share in [0, 1] of a box, all in one picture, that the box about a piece within it fills."""
-    if not piece.any():
-        return 0.0
     rows, columns = np.flatnonzero(piece.any(axis=1)), np.flatnonzero(piece.any(axis=0))
     return float((np.ptp(rows) + 1) * (np.ptp(columns) + 1) / box.sum())
 

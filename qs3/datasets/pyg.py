@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -94,8 +93,8 @@ def from_pyg(
 
     Args:
         datasets: by split ("train", "validation", "test"). Each cloud has `pos` [n, 3], and all or
-            none of them a `y` of one whole number. Its `id` names it, if it has one; a whole number
-            counts within class and split, like the position of a cloud without.
+            none of them a `y` of one whole number. Its `id` names it, if it is text; else its class
+            and position.
         folder: of the new dataset.
         classes: names in the order of `y`, or "modelnet40"; None: `classes` of the first dataset,
             if it has any; without labels the benchmark's ten.
@@ -106,21 +105,21 @@ def from_pyg(
     folder = Path(folder)
     if is_finished(folder) or is_begun(folder):
         raise ConfigError(f"{folder} holds something already; delete it or choose another folder")
-    taken = {
-        (split, number): _read(dataset[number], f"cloud {number} of {split!r}")
+    taken = [
+        (split, number, dataset[number])
         for split, dataset in datasets.items()
         for number in range(len(dataset))  # PyG's way of iterating needs an IndexError to end
-    }
-    names = _classes(classes, next(iter(datasets.values())), [y for _, y, _ in taken.values()])
-    sizes = [len(pos) for pos, _, _ in taken.values()]
-    points = sizes[0] if points is None else points
+    ]
+    labels = [_label(one, f"cloud {number} of {split!r}") for split, number, one in taken]
+    names = _classes(classes, next(iter(datasets.values())), labels)
     clouds, rows = [], []
-    for (split, number), (pos, y, key) in taken.items():
-        thinned = farthest_point_sampling_np(pos, points) if len(pos) > points else slice(None)
-        clouds.append(pos[thinned])
-        cls = "" if y is None else names[y]
-        if not isinstance(key, str):
-            key = f"{cls or 'cloud'}/{split}/{number if key is None else key:06d}"
+    for (split, number, one), y in zip(taken, labels, strict=True):
+        pos = one.pos.detach().cpu().numpy().astype(np.float32)
+        points = len(pos) if points is None else points
+        clouds.append(pos[farthest_point_sampling_np(pos, points)] if len(pos) > points else pos)
+        cls, key = "" if y is None else names[y], getattr(one, "id", None)
+        if not key or not isinstance(key, str):
+            key = f"{cls or 'cloud'}/{split}/{number:06d}"
         rows.append(ManifestRow(id=key, cls=cls, split=split, valid_points=len(pos)))
     return write_pointset(
         folder,
@@ -132,21 +131,18 @@ def from_pyg(
     )
 
 
-def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str | int | None]:
-    """Points [n, 3] float32, label and id of one cloud."""
-    y, key = getattr(item, "y", None), getattr(item, "id", None)
-    if getattr(item, "face", None) is not None:
+def _label(cloud: Data, where: str) -> int | None:
+    """The class of a cloud, if it has one."""
+    if getattr(cloud, "face", None) is not None:
         raise DataError(f"{where} is a mesh: give the dataset transform=SamplePoints(n)")
-    label = None if y is None else int(y)
-    if label is not None and label != y:
+    y = getattr(cloud, "y", None)
+    if y is not None and int(y) != y:
         raise DataError(f"{where}: y is {y}, expected one whole number, the class")
-    # A collated dataset has a number as a tensor.
-    name: Any = key.item() if isinstance(key, Tensor | np.ndarray | np.generic) else key
-    return item.pos.detach().cpu().numpy().astype(np.float32), label, None if name == "" else name
+    return None if y is None else int(y)
 
 
 def _classes(
-    given: str | Sequence[str] | None, dataset: Any, labels: list[int | None]
+    given: str | Sequence[str] | None, dataset: object, labels: list[int | None]
 ) -> list[str]:
     known = [label for label in labels if label is not None]
     names = given if given is not None else getattr(dataset, "classes", None)
@@ -178,13 +174,9 @@ def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) ->
     elif (batch.diff() < 0).any():
         raise ValueError("batch is not sorted: the points of each cloud must be together")
     sizes = batch.unique_consecutive(return_counts=True)[1].tolist()
-    if len(set(sizes)) == 1:
-        return _edges(x.view(len(sizes), sizes[0], -1), k, loop)
     starts = np.cumsum([0, *sizes]).tolist()
-    parts = [
-        _edges(cloud[None], k, loop) + start
-        for start, cloud in zip(starts, x.split(sizes), strict=False)
-    ]
+    clouds = [x.view(len(sizes), sizes[0], -1)] if len(set(sizes)) == 1 else x[None].split(sizes, 1)
+    parts = [_edges(cloud, k, loop) + start for start, cloud in zip(starts, clouds, strict=False)]
     return torch.cat([x.new_empty((2, 0), dtype=torch.int64), *parts], dim=1)
 
 

@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,7 +46,7 @@ from qs3.datasets.scannet_files import (
 from qs3.errors import DataError
 from qs3.store.meta import MadeOf
 from qs3.utils.files import reading
-from qs3.utils.settings import settings
+from qs3.utils.settings import Count, settings
 
 log = logging.getLogger(__name__)
 
@@ -60,31 +60,13 @@ _CELL_DEPTH_PX = 2.0
 _SAME_PLACE_M = 1e-6
 
 
-@dataclass(frozen=True)
-class SceneTask(FrameTask):
-    """One scene: its folder, and the bytes of its files (another size means another file)."""
-
-    folder: Path = Path()
-    size: int = 0
-
-    @property
-    def name(self) -> str:
-        """Of its part."""
-        return f"{self.folder.name}_{self.size}"
-
-    @property
-    def stem(self) -> str:
-        """Of its objects' ids."""
-        return self.folder.name
-
-
 @settings
 class ScanNet(CutDataset):
     """Raw ScanNet: a folder of scenes; see the module and `qs3.datasets.scannet_files`.
 
     Attributes:
         labels: scannetv2-labels.combined.tsv, in the folder or by its whole path.
-        train, val: the lists of scenes, likewise; the second is our split "test".
+        train, val: the lists of scenes, likewise; the second is the split "test".
         min_points: a frame counts if it shows more points of the object than this.
         views: frames fused, far from each other in direction; fewer if there are fewer.
         stride: look at every n-th frame only; 10 takes a tenth of the time.
@@ -94,8 +76,8 @@ class ScanNet(CutDataset):
     train: str = "scannetv2_train.txt"
     val: str = "scannetv2_val.txt"
     min_points: Annotated[int, Ge(0)] = 1000
-    views: Annotated[int, Ge(1)] = 10
-    stride: Annotated[int, Ge(1)] = 1
+    views: Count = 10
+    stride: Count = 1
 
     recorded: ClassVar[str] = "extraction"
 
@@ -115,13 +97,14 @@ class ScanNet(CutDataset):
         folders = [self.root / scene for scene in sorted(split_of)]
         there = [folder for folder in folders if folder.is_dir()]
         log.info("scenes that are there: %d of the lists' %d", len(there), len(folders))
+        # Another size means another file.
+        sizes = [sum(p.stat().st_size for p in _files(at) if p.is_file()) for at in there]
         return [
-            SceneTask(
-                number, split_of[at.name], at.name[:9], "structure", "given",
-                folder=at, size=sum(p.stat().st_size for p in _files(at) if p.is_file()),
+            FrameTask(
+                f"{at.name}_{size}", at.name, split_of[at.name], number, "structure", "given", at
             )
-            for number, at in enumerate(there)
-        ]  # fmt: skip
+            for number, (at, size) in enumerate(zip(there, sizes, strict=True))
+        ]
 
     def cutter(self) -> Cutter:
         """See `CutDataset`."""
@@ -136,8 +119,7 @@ def _files(scene: Path) -> list[Path]:
 
 def _extract(data: ScanNet, task: FrameTask, label_map: LabelMap) -> list[Cut]:
     """The objects of a scene: points in the scene's world, metres, z up."""
-    assert isinstance(task, SceneTask)
-    sens, instances, labels, aggregation = _files(task.folder)
+    sens, instances, labels, aggregation = _files(task.known)
     labelled = read_objects(aggregation, label_map)
     with ExitStack() as stack:
         scan = _Scan(
@@ -145,35 +127,32 @@ def _extract(data: ScanNet, task: FrameTask, label_map: LabelMap) -> list[Cut]:
             instances=stack.enter_context(MaskArchive(instances, INSTANCES)),
             labels=stack.enter_context(MaskArchive(labels, LABELS)),
         )
-        every = range(0, len(scan.sens), data.stride)
+        every = range(0, scan.sens.header.frames, data.stride)
         frames = [f for f in every if scan.sens.has_pose(f) and f in scan.instances.frames]
         if not frames:
             raise DataError(f"{sens}: no frame has a finite pose and a mask")
         sightings = _first_pass(scan, frames, labelled, data.min_points)
-        chosen = {one: sightings[one].viewpoints(data.views) for one in labelled}
+        chosen = {one: _viewpoints(sightings[one], data.views) for one in labelled}
         crops = _second_pass(scan, chosen, label_map, data.min_points)
     found = []
     for one in labelled:
         used = sorted(crops[one])
-        points = np.concatenate(
-            [np.empty((0, 3), np.float32), *(crops[one][frame] for frame in used)]
-        )
+        points = np.concatenate([np.empty((0, 3), np.float32), *(crops[one][f] for f in used)])
         reason = ""
         if not chosen[one]:
             reason = f"no frame shows more than {data.min_points} of its points"
         elif not used:
             reason = "the label masks of its chosen frames give it another class"
         origin = f"scene {task.stem}, object {one.object_id}, label {one.label!r}, frames "
-        origin += f"{' '.join(map(str, used)) or 'none'}, of {len(sightings[one].frames)}"
+        origin += f"{' '.join(map(str, used)) or 'none'}, of {len(sightings[one])}"
         found.append(Cut(one.cls, origin, points, len(points), reason, {}, len(used)))
     return found
 
 
 class Registration:
-    """The depth camera and the masks of one resolution."""
+    """The depth camera and masks [h, w] of one resolution, of the shape of colour images."""
 
     def __init__(self, header: SensHeader, mask_shape: tuple[int, int]) -> None:
-        """Prepare the rays for masks [h, w], which must have the shape of colour images."""
         height, width = mask_shape
         scale = (width / header.colour_px[0], height / header.colour_px[1])
         # Half a pixel of slack: a halved image of odd height is rounded.
@@ -222,15 +201,15 @@ class Registration:
         keep: Bool[np.ndarray, "h w"],
         pose: Float[np.ndarray, "4 4"],
     ) -> Float[np.ndarray, "n 3"]:
-        """[n, 3] float64 world points of the pixels `keep`; `pose` is world_from_depth."""
+        """World points, float64, of the pixels `keep`; `pose` is world_from_depth."""
         local = self._rays[keep] * depth_m[keep, None].astype(np.float64)
         return local @ pose[:3, :3].T + pose[:3, 3]
 
     def _visible(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> Bool[np.ndarray, " n"]:
-        """[n] bool: nothing clearly nearer lies in the point's cell or one next to it.
+        """Whether nothing clearly nearer lies in the point's cell or one next to it.
 
         The cells next to it stand for sides of a nearer thing that only the colour camera sees:
-        no depth was measured there. It costs what lies behind an edge a few pixels.
+        no depth was measured there.
         """
         height, width = self._mask_shape
         col = ((u + 0.5) / self._cell_px).astype(np.int64)
@@ -253,47 +232,34 @@ def agreed(mask: UInt[np.ndarray, "h w"]) -> UInt[np.ndarray, "h w"]:
     return np.where(cv2.erode(mask, square) == cv2.dilate(mask, square), mask, 0).astype(mask.dtype)
 
 
-@dataclass(eq=False)
-class Sightings:
-    """What the first pass notes of one object: the frames that show enough of it.
+class Sighting(NamedTuple):
+    """A frame that shows enough of an object: its number, where the camera stood, and the points.
 
-    Attributes:
-        frames, eyes_m, counts, sums_m: of each such frame its number, the camera's position [3],
-            the number of the object's points, and their sum [3] in the world.
+    `sum_m` is the sum of the object's points in the world.
     """
 
-    frames: list[int] = field(default_factory=list)
-    eyes_m: list[np.ndarray] = field(default_factory=list)
-    counts: list[int] = field(default_factory=list)
-    sums_m: list[np.ndarray] = field(default_factory=list)
+    frame: int
+    eye_m: Float[np.ndarray, " 3"]
+    points: int
+    sum_m: Float[np.ndarray, " 3"]
 
-    def see(self, frame: int, points_m: np.ndarray, eye_m: np.ndarray, more_than: int) -> None:
-        """Note a frame: [n, 3] points of the object in the world, [3] the camera's position."""
-        if len(points_m) > more_than:
-            self.frames.append(frame)
-            self.eyes_m.append(eye_m)
-            self.counts.append(len(points_m))
-            self.sums_m.append(points_m.sum(axis=0))
 
-    def viewpoints(self, count: int) -> tuple[int, ...]:
-        """Well-spread frames, ascending; see `spread`."""
-        if not self.frames:
-            return ()
-        centre = np.sum(self.sums_m, axis=0) / sum(self.counts)
-        chosen = spread(np.array(self.eyes_m) - centre, self.counts, count)
-        return tuple(sorted(self.frames[i] for i in chosen))
+def _viewpoints(seen: Sequence[Sighting], count: int) -> list[int]:
+    """Well-spread frames, ascending; see `spread`."""
+    if not seen:
+        return []
+    points = [one.points for one in seen]
+    centre = np.sum([one.sum_m for one in seen], axis=0) / sum(points)
+    chosen = spread(np.array([one.eye_m for one in seen]) - centre, points, count)
+    return sorted(seen[i].frame for i in chosen)
 
 
 def spread(towards_m: Float[np.ndarray, "n 3"], points: Sequence[int], count: int) -> list[int]:
     """Up to `count` viewpoints, in order: farthest point sampling of their directions.
 
     The first is the frame with most points; each next one is that whose direction from the
-    object is farthest from those of all taken. Of equals the earliest is taken.
-
-    Args:
-        towards_m: from the object's centre to the camera of each frame.
-        points: of the object in each frame.
-        count: of viewpoints.
+    object is farthest from those of all taken. Of equals the earliest is taken. `towards_m` is from
+    the object's centre to the camera of each frame.
     """
     length = np.linalg.norm(towards_m, axis=1, keepdims=True)
     directions = towards_m / np.where(length > 0, length, 1.0)
@@ -330,9 +296,9 @@ class _Scan:
 
 def _first_pass(
     scan: _Scan, frames: Sequence[int], labelled: Sequence[Labelled], min_points: int
-) -> dict[Labelled, Sightings]:
+) -> dict[Labelled, list[Sighting]]:
     """How much of which object each frame shows."""
-    sightings = {one: Sightings() for one in labelled}
+    sightings: dict[Labelled, list[Sighting]] = {one: [] for one in labelled}
     for frame in frames:
         mask = scan.instances.read(frame)
         there = np.flatnonzero(np.bincount(mask.ravel()))
@@ -343,7 +309,9 @@ def _first_pass(
         pose = scan.sens.poses[frame]
         for one in shown:
             points = registration.world(depth_m, ids == one.object_id + 1, pose)
-            sightings[one].see(frame, points, pose[:3, 3], min_points)
+            if len(points) > min_points:
+                seen = Sighting(frame, pose[:3, 3], len(points), points.sum(axis=0))
+                sightings[one].append(seen)
     return sightings
 
 

@@ -42,6 +42,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -96,10 +97,10 @@ class SensHeader:
 
 
 class SensFile:
-    """An open recording; a context manager.
+    """An open recording; a context manager. DataError if it is not a recording or broken off.
 
-    Opening it reads the header and, skipping the images, every frame's pose: a broken-off file is
-    found out at once. Images are read when they are asked for, so memory is that of one frame.
+    Opening it reads the header and, skipping the images, every frame's pose; images are read when
+    they are asked for.
 
     Attributes:
         header: what holds for all frames.
@@ -107,7 +108,6 @@ class SensFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file; DataError if it is not a recording or broken off."""
         self.path = path
         with reading(path), ExitStack() as stack:
             self._file = stack.enter_context(open(path, "rb"))
@@ -119,8 +119,7 @@ class SensFile:
                 self.poses[frame] = np.reshape(pose, (4, 4))
                 self._depth_at.append((self._file.tell() + colour, depth))
                 self._file.seek(colour + depth, 1)
-            if self._file.tell() > path.stat().st_size:
-                raise ValueError("it is broken off; download it again")
+            assert self._file.tell() <= path.stat().st_size, "it is broken off; download it again"
             stack.pop_all()  # closed by __exit__
 
     def __enter__(self) -> SensFile:
@@ -128,10 +127,6 @@ class SensFile:
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        return self.header.frames
 
     def has_pose(self, frame: int) -> bool:
         """Whether the frame's pose is finite and a rigid motion."""
@@ -157,10 +152,9 @@ class SensFile:
         colour_k, colour, depth_k, depth = np.array(values[:64], np.float64).reshape(4, 4, 4)
         _, packed, colour_w, colour_h, depth_w, depth_h, shift, frames = values[64:]
         colour_k, depth_k = colour_k[:3, :3].copy(), depth_k[:3, :3].copy()
-        fits = all(
-            k[0, 0] > 0 and k[1, 1] > 0 and np.isfinite(k).all() for k in (colour_k, depth_k)
-        )
-        assert all((fits, is_rigid(colour), is_rigid(depth))), "not matrices of cameras"
+        for k, extrinsic in ((colour_k, colour), (depth_k, depth)):
+            good = k[0, 0] > 0 and k[1, 1] > 0 and np.isfinite(k).all() and is_rigid(extrinsic)
+            assert good, "not matrices of a camera"
         assert packed in (0, _ZLIB), "its depth is in Occipital's compression"
         assert 1 <= shift < np.inf, f"a depth shift of {shift}"  # 1000: millimetres
         return SensHeader(
@@ -186,10 +180,13 @@ def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
 
 
 class MaskArchive:
-    """An open zip of masks, of the folder `INSTANCES` or `LABELS`; a context manager."""
+    """An open zip of masks, of the folder `INSTANCES` or `LABELS`; a context manager.
+
+    Attributes:
+        frames: that have a mask.
+    """
 
     def __init__(self, path: Path, folder: str) -> None:
-        """Open the zip; DataError if it is damaged, or has no such masks."""
         self.path = path
         pattern = re.compile(rf"(?:[\w-]+/)?{re.escape(folder)}/(\d+)\.png")
         with reading(path):
@@ -197,11 +194,7 @@ class MaskArchive:
             named = [(pattern.fullmatch(name), name) for name in self._zip.namelist()]
             self._members = {int(match[1]): name for match, name in named if match}
             assert self._members, f"it has no {folder}/<frame>.png"
-
-    @property
-    def frames(self) -> frozenset[int]:
-        """The frames that have a mask."""
-        return frozenset(self._members)
+        self.frames = frozenset(self._members)
 
     def __enter__(self) -> MaskArchive:
         return self
@@ -210,7 +203,7 @@ class MaskArchive:
         self._zip.close()
 
     def read(self, frame: int) -> UInt[np.ndarray, "h w"]:
-        """[h, w] uint8 or uint16, the mask of a frame; DataError if there is none."""
+        """The mask of a frame; DataError if there is none."""
         with reading(f"{self.path}, frame {frame}"):
             data = np.frombuffer(self._zip.read(self._members[frame]), dtype=np.uint8)
             image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -218,27 +211,17 @@ class MaskArchive:
         return image
 
 
-@dataclass(frozen=True)
-class LabelMap:
-    """The label map, as far as the ten classes need it.
-
-    Attributes:
-        class_of_label: annotator's word to class; words of no class are left out.
-        class_of_id: number in a label mask to class; other numbers are left out.
-    """
+class LabelMap(NamedTuple):
+    """Annotators' words, and numbers in a label mask, to the ten classes; others are left out."""
 
     class_of_label: Mapping[str, str]
     class_of_id: Mapping[int, str]
 
 
-@dataclass(frozen=True)
-class Labelled:
-    """An object of one of the ten classes.
+class Labelled(NamedTuple):
+    """An object of one of the ten classes, with the annotators' word.
 
-    Attributes:
-        object_id: `objectId` of the aggregation; its mask's pixels are this + 1.
-        label: the annotators' word.
-        cls: one of `qs3.classes.CLASSES`.
+    Its mask's pixels are `object_id` + 1, the `objectId` of the aggregation.
     """
 
     object_id: int

@@ -35,7 +35,7 @@ from jaxtyping import Float
 
 from qs3.datasets.cutting import Box, Piece, box_mask, cut
 from qs3.datasets.depth_images import DepthImage, Pinhole
-from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, load_mat
+from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, frame_task, load_mat
 from qs3.store.meta import MadeOf
 from qs3.utils.files import reading
 from qs3.utils.settings import settings
@@ -130,7 +130,7 @@ class SUNRGBD(FrameDataset):
         """See `FrameDataset`; frames of the chosen sensors that are of a split."""
         splits = read_splits(self.root, self.splits)
         return [
-            FrameTask(one.number, split, _cluster(one, self.block), one.sensor, "published")
+            frame_task(one.number, split, _cluster(one, self.block), one.sensor, "published")
             for one in read_frames(self.root)
             if one.sensor in self.sensors and (split := splits.get(one.folder))
         ]

@@ -46,7 +46,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 MAKES_CLOUDS = (
     *("catalogue", "generation", "meshes", "sensors"),
     *("geometry/cameras.py", "geometry/sampling.py"),
-    *("datasets/cutting.py", "datasets/depth_images.py", "datasets/regions.py"),
+    *("datasets/cutting.py", "datasets/depth_images.py"),
     *("utils/seeding.py", "classes.py"),
 )
 """Folders and modules that decide the bytes of a cloud."""

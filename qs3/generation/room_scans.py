@@ -16,9 +16,8 @@ from annotated_types import Ge, Interval
 from jaxtyping import Bool
 from pydantic import InstanceOf
 
-from qs3.datasets.cutting import cut, own_pixels
+from qs3.datasets.cutting import Rules, cut, own_pixels, pieces
 from qs3.datasets.depth_images import DepthImage, Pinhole
-from qs3.datasets.regions import Rules, pieces
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
 from qs3.generation.kept import Keep, preview_of, provenance_of, save_view

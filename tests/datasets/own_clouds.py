@@ -8,9 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from qs3.datasets.clouds import checked, parse_cloud, with_depth
+from qs3.datasets.clouds import CloudFolder, checked, parse_cloud, with_depth
 from qs3.datasets.domain import Domain
-from qs3.datasets.folders import CloudFolder
 
 TWO = ("bed", "chair")
 CLOUD = np.arange(12, dtype=np.float64).reshape(4, 3) / 8  # exact in float32 and in text

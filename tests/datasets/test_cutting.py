@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qs3.datasets.cutting import Box, box_mask, cut
+from qs3.datasets.cutting import Box, Limits, Rules, body, box_mask, cut, occlusion, pieces, rim
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
 from qs3.datasets.nyuv2 import AREA
-from qs3.datasets.regions import Limits, Rules, body, occlusion, pieces, rim
 from tests.fixtures.frame_files import Shot, Thing, kinect
 
 STEP_M = 0.06  # half a step of a Kinect's disparity and four sigma of noise at 3.5 m

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qs3.datasets.arrays import named_arrays, read_h5
 from qs3.datasets.clouds import parse_clouds
 from qs3.datasets.depth_images import read_depth, read_intrinsics, read_mask
-from qs3.datasets.folders import sample_file
 from qs3.datasets.frames import load_mat
 from qs3.datasets.nyuv2 import LabelledFrames, read_splits
 from qs3.datasets.object_archive import read_archive
+from qs3.datasets.published import named_arrays, read_h5, sample_file
 from qs3.datasets.scannet_files import (
     INSTANCES,
     MaskArchive,

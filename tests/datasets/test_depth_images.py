@@ -135,7 +135,7 @@ ROS = {"image_width": 640, "image_height": 480, "camera_matrix": {"rows": 3, "da
 def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, content, size, bent):
     text = content if isinstance(content, str) else json.dumps(content)
     (tmp_path / "a.yaml").write_text(text)
-    found = read_intrinsics("a.yaml", tmp_path)
+    found = read_intrinsics(str(tmp_path / "a.yaml"))
     scale = 1.0 if "depth_scale" in text else None
     camera = Pinhole(525, 526, 319.5, 239.5)
     assert found == Intrinsics(camera, (640, 480) if size else None, bent, scale)
@@ -152,7 +152,7 @@ def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, content, size,
 def test_what_holds_no_intrinsics(tmp_path, text):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(DataError, match=r"camera\.yaml"):
-        read_intrinsics("camera.yaml", tmp_path)
+        read_intrinsics(str(tmp_path / "camera.yaml"))
 
 
 @pytest.mark.parametrize(

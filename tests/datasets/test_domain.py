@@ -15,7 +15,7 @@ from qs3.commands.download import scannet
 from qs3.config.hydra import build
 from qs3.datasets import domain as module
 from qs3.datasets.domain import Domain, check_or_make
-from qs3.datasets.folders import PublishedTree
+from qs3.datasets.published import PublishedTree
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.commands import parse
 from tests.composing import compose

@@ -13,7 +13,6 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from qs3.datasets.arrays import PointDAH5
 from qs3.datasets.download import (
     BY_HAND,
     MARK,
@@ -24,7 +23,7 @@ from qs3.datasets.download import (
     provide,
     unpack,
 )
-from qs3.datasets.folders import PublishedTree
+from qs3.datasets.published import PointDAH5, PublishedTree
 from qs3.errors import DataError
 from tests.fixtures import published as fixtures
 from tests.running import main

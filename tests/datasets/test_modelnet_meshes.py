@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qs3.classes import CLASSES
-from qs3.datasets.folders import ModelNetMeshes
+from qs3.datasets.published import ModelNetMeshes
 from tests.fixtures.modelnet import off_text, write_off_tree
 
 SPLITS = {"train": 2, "test": 1}

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from qs3.datasets.folders import CloudFolder
+from qs3.datasets.clouds import CloudFolder
 from qs3.datasets.importing import import_into
 from qs3.errors import DataError
 from qs3.store.store import open_pointset, read_manifest
@@ -72,18 +72,29 @@ def test_up_is_a_rotation_to_z(tmp_path: Path, up: str) -> None:
     np.testing.assert_array_equal(importer.turn(axis[None], "bed")[0], [0, 0, 1])
 
 
+def test_every_fifth_of_a_class_is_for_test(tmp_path: Path) -> None:
+    for cls in TWO:
+        for i in range(7):
+            write(tmp_path / cls / f"{i}.xyz")
+    for every, expected in ((5, ["bed/test/4", "chair/test/4"]), (0, [])):
+        _, rows = CloudFolder(tmp_path, points=4, test_every=every).read(TWO, tmp_path)
+        assert [row.id for row in rows if row.split == "test"] == expected
+        assert len(rows) == 14
+
+
 def test_wrong_folders_and_names(tmp_path: Path) -> None:
-    write(tmp_path / "bed" / "a.xyz")
-    write(tmp_path / "boat" / "a.xyz")
-    with pytest.raises(DataError, match="boat"):
-        CloudFolder(tmp_path, points=4).read(TWO, tmp_path)
-    write(tmp_path / "b" / "bed" / "a.xyz")
-    write(tmp_path / "b" / "bed" / "a.ply")
-    with pytest.raises(DataError, match="one name"):
-        CloudFolder(tmp_path / "b", points=4).read(TWO, tmp_path)
-    write(tmp_path / "c" / "bed" / "train" / "deep" / "a.xyz")
-    with pytest.raises(DataError, match="deep"):
-        CloudFolder(tmp_path / "c", points=4).read(TWO, tmp_path)
+    for place, word in (
+        ("a/boat/a", "boat"),
+        ("c/bed/train/chair/a", "chair"),
+        ("d/bed/dev/a", "dev"),
+    ):
+        write(tmp_path / f"{place}.xyz")
+        with pytest.raises(DataError, match=word):
+            CloudFolder(tmp_path / place[0], points=4).read(TWO, tmp_path)
+    write(tmp_path / "in" / "bed" / "a.xyz")
+    write(tmp_path / "in" / "bed" / "a.ply")
+    with pytest.raises(DataError, match="bed/train/a"):  # one name twice
+        own(tmp_path).open()
     (tmp_path / "e").mkdir()
     assert not CloudFolder(tmp_path / "e").is_there()
 
@@ -103,8 +114,8 @@ def test_files_of_several_clouds(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])
 def test_damage_can_be_skipped_and_is_recorded(tmp_path: Path, suffix: str) -> None:
-    """A damaged file, a cloud without points, a label of no class."""
-    many, labels = np.stack([CLOUD, CLOUD + 1, CLOUD * np.nan, CLOUD]), np.array([1, 7, 0, 0])
+    """A damaged file, and a cloud without points; a label of no class is an error always."""
+    many, labels = np.stack([CLOUD, CLOUD * np.nan, CLOUD]), np.array([1, 0, 0])
     folder = tmp_path / "in"
     folder.mkdir()
     if suffix == ".npz":
@@ -113,14 +124,17 @@ def test_damage_can_be_skipped_and_is_recorded(tmp_path: Path, suffix: str) -> N
         with h5py.File(folder / "a.h5", "w") as file:
             file["data"], file["label"] = many, labels
     (folder / "b.npz").write_bytes(b"PK")
-    with pytest.raises(DataError, match=rf"a\{suffix}, cloud 1"):
+    with pytest.raises(DataError, match=r"a\.|b\.npz"):
         own(tmp_path).open()
     data = own(tmp_path, on_error="skip").open()
-    assert data.ids == ("bed/train/a_0003", "chair/train/a_0000")
+    assert data.ids == ("bed/train/a_0002", "chair/train/a_0000")
     rows = read_manifest(tmp_path / "store", TWO)
     left_out = {row.origin for row in rows if row.status == "skipped"}
-    assert left_out == {f"a{suffix}[1]", f"a{suffix}[2]", "b.npz"}
+    assert left_out == {f"a{suffix}[1]", "b.npz"}
     own(tmp_path, on_error="skip").open()
+    np.savez(folder / "c.npz", points=many[:1], label=np.array([7]))
+    with pytest.raises(DataError, match=r"c\.npz"):
+        own(tmp_path, on_error="skip").importer().items(TWO)
 
 
 def test_changed_files_are_noticed(tmp_path: Path) -> None:

@@ -45,8 +45,6 @@ def test_each_number_of_a_mask_is_one_object_and_lies_on_its_thing():
         assert len(where) > 0.8 * ((one.mask) & (depth > 0)).sum()
         assert (one.tier, one.cautions, one.up, one.why) == ("clean", (), GIVEN, "")
         assert one.without_depth == (one.mask & (depth == 0)).sum() > 0
-    (only,) = point_out(depth, CAMERA, mask=mask, only=7, up=ROOM.up_in_camera)
-    np.testing.assert_array_equal(only.piece.points_m, found[1].piece.points_m)
     (bare,) = point_out(depth, CAMERA, mask=mask == 7, up=ROOM.up_in_camera)
     assert bare.name == ""
     np.testing.assert_array_equal(bare.piece.points_m, found[1].piece.points_m)
@@ -158,7 +156,6 @@ def test_a_fitted_vertical_is_right_or_not_sure(pitch_deg):
         {"mask": np.ones((4, 4), int)},
         {"mask": np.zeros((480, 640), int)},
         {"mask": np.ones((480, 640))},
-        {"mask": np.ones((480, 640), int), "only": 3},
         {"box": (5, 5, 5, 9)},
         {"box": (700, 5, 900, 9)},
         {"box": (0.3, 0.2, 0.6, 0.8)},  # fractions of the picture

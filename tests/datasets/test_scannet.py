@@ -15,8 +15,8 @@ import pytest
 
 from qs3.classes import CLASSES
 from qs3.datasets.domain import Domain
-from qs3.datasets.folders import PublishedTree
 from qs3.datasets.importing import import_into
+from qs3.datasets.published import PublishedTree
 from qs3.datasets.scannet import ScanNet
 from qs3.errors import DataError
 from qs3.report.datasets import distance_to_mesh

@@ -14,8 +14,8 @@ from trimesh.proximity import closest_point_naive
 
 from qs3.catalogue import Catalogue
 from qs3.config.hydra import build
+from qs3.datasets.cutting import Limits, Rules
 from qs3.datasets.depth_images import DepthImage, Pinhole
-from qs3.datasets.regions import Limits, Rules
 from qs3.generation.kept import Keep
 from qs3.generation.room_scans import RoomCamera, one_piece, yaw_between
 from qs3.generation.scenes import Room, Support

@@ -27,7 +27,7 @@ from torch import nn
 
 import qs3
 from qs3.classes import CLASSES
-from qs3.datasets.arrays import named_arrays
+from qs3.datasets.published import named_arrays
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.export import export_folder
 from qs3.inference.model_file import (
