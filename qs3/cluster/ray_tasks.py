@@ -12,7 +12,6 @@ import logging
 import math
 import os
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -29,7 +28,6 @@ log = logging.getLogger(__name__)
 
 _POLL_S = 1.0
 _LOST_NODES = 10  # with one task: more is no accident
-_QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"}
 
 
 @dataclass
@@ -98,104 +96,72 @@ class RayTasks:
         import ray
 
         with _connected(ray, self):
-            yield from _Run(ray, self, make_worker).outcomes(tasks)
+            memory: dict[str, Any] = {"memory": self.memory_bytes} if self.memory_bytes else {}
+            remote = ray.remote(
+                num_cpus=self.cpus,
+                num_gpus=self.gpus,
+                max_calls=self.tasks_per_process,
+                max_retries=0,
+                **memory,
+            )(_do)
+            # The key is of this run: a process of Ray may have served another one.
+            maker, key = ray.put(make_worker), os.urandom(16)
+            waiting = (_Work(name, task) for name, task in tasks)
+            pending: dict[Any, _Work] = {}
+            again: list[_Work] = []
+            try:
+                while True:
+                    # Twice as many as can run: a free core need not wait for this process.
+                    while len(pending) < 2 * self.at_once:
+                        work = again.pop() if again else next(waiting, None)
+                        if work is None:
+                            break
+                        pending[remote.remote(maker, key, work.task)] = work
+                    if not pending:
+                        return
+                    ready, _ = ray.wait(list(pending), timeout=_POLL_S)
+                    for ref in ready:
+                        work = pending.pop(ref)
+                        if (outcome := self._outcome(ray, ref, work)) is not None:
+                            yield outcome
+                        else:
+                            again.append(work)
+            finally:
+                for ref in pending:
+                    with suppress(Exception):  # it has ended by now, or the cluster is gone
+                        ray.cancel(ref, force=True)
 
-
-class _Run:
-    """One call of `RayTasks.run`, with the cluster at hand."""
-
-    def __init__(self, ray: ModuleType, how: RayTasks, make_worker: Callable[[], Any]) -> None:
-        self.ray, self.how = ray, how
-        memory = {} if how.memory_gb is None else {"memory": how.memory_bytes}
-        self.remote = ray.remote(
-            num_cpus=how.cpus,
-            num_gpus=how.gpus,
-            max_calls=how.tasks_per_process,
-            max_retries=0,
-            **memory,
-        )(_do)
-        self.make_worker = ray.put(make_worker)
-        self.key = os.urandom(16)  # of this run: a process of Ray may have served another one
-        self.pending: dict[Any, _Work] = {}
-        self.again: list[_Work] = []
-        self.nodes: Counter[str] = Counter()
-        self.troubles: Counter[str] = Counter()
-
-    def outcomes(self, tasks: Iterable[tuple[str, Any]]) -> Iterator[Outcome[Any]]:
-        waiting = (_Work(name, task) for name, task in tasks)
-        try:
-            while True:
-                # Twice as many as can run: a core that gets free need not wait for this process.
-                while len(self.pending) < 2 * self.how.at_once:
-                    work = self.again.pop() if self.again else next(waiting, None)
-                    if work is None:
-                        break
-                    self.pending[self.remote.remote(self.make_worker, self.key, work.task)] = work
-                if not self.pending:
-                    self._report()
-                    return
-                ready, _ = self.ray.wait(list(self.pending), timeout=_POLL_S)
-                for ref in ready:
-                    if (outcome := self._outcome(ref, self.pending.pop(ref))) is not None:
-                        yield outcome
-        finally:
-            for ref in self.pending:
-                with suppress(Exception):  # it has ended by now, or the cluster is gone
-                    self.ray.cancel(ref, force=True)
-
-    def _outcome(self, ref: Any, work: _Work) -> Outcome[Any] | None:
+    def _outcome(self, ray: ModuleType, ref: Any, work: _Work) -> Outcome[Any] | None:
         """What became of a task; None if it is to be done again."""
-        errors = self.ray.exceptions
+        errors = ray.exceptions
         try:
-            node, result = self.ray.get(ref)
+            return Outcome(work.name, ray.get(ref))
         except errors.RayTaskError as error:  # the worker's own error ends everything
             raise error.cause if isinstance(error.cause, Exception) else error from error
         except (errors.NodeDiedError, errors.ObjectLostError, errors.OwnerDiedError) as error:
             work.lost += 1
-            self._note("a node was lost", work, error)
-            if work.lost >= _LOST_NODES:
-                return Outcome(work.name, None, died=True)
+            log.warning("%s: a node was lost (%s)", work.name, type(error).__name__)
         except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
             work.deaths += 1
-            self._note("a process ended", work, error)
-            if work.deaths >= self.how.attempts:
-                return Outcome(work.name, None, died=True)
+            log.warning("%s: its process ended (%s)", work.name, type(error).__name__)
         except errors.RayError as error:
             raise ClusterError(
-                f"Ray ended the run at {work.name}: {type(error).__name__}: "
-                f"{' '.join(str(error).split())[:300]}. Run the same command again: it goes on"
+                f"Ray ended the run at {work.name} ({error}); run the same command again"
             ) from error
-        else:
-            self.nodes[node] += 1
-            return Outcome(work.name, result)
-        self.again.append(work)
-        return None
-
-    def _note(self, what: str, work: _Work, error: Exception) -> None:
-        self.troubles[what] += 1
-        log.warning("%s: %s (%s)", work.name, what, type(error).__name__)
-
-    def _report(self) -> None:
-        """Who did how much, and what went wrong on the way."""
-        shares = ", ".join(f"{n} by {node}" for node, n in self.nodes.most_common())
-        log.info("%d nodes: %s", len(self.nodes), shares)
-        for what, count in self.troubles.items():
-            log.warning("%s, %d times; its task was done again", what, count)
+        given_up = work.lost >= _LOST_NODES or work.deaths >= self.attempts
+        return Outcome(work.name, None, died=True) if given_up else None
 
 
 _WORKERS: dict[bytes, Any] = {}
 """In a process of Ray: the worker of the run that it serves."""
 
 
-def _do(make_worker: Callable[[], Any], key: bytes, task: Any) -> tuple[str, Any]:
-    """A task of Ray: the name of its node, and the result."""
-    import ray
-
+def _do(make_worker: Callable[[], Any], key: bytes, task: Any) -> Any:
+    """A task of Ray."""
     if key not in _WORKERS:
         _WORKERS.clear()
         _WORKERS[key] = make_worker()
-    context = ray.get_runtime_context()
-    return f"{ray.util.get_node_ip_address()} ({context.get_node_id()[:6]})", _WORKERS[key](task)
+    return _WORKERS[key](task)
 
 
 @contextmanager
@@ -204,8 +170,7 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
     if ray.is_initialized():  # by whoever called us from Python: theirs to end
         yield
         return
-    kept = {name: os.environ.get(name) for name in _QUIET}
-    os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     quiet = {"log_to_driver": False, "logging_level": logging.WARNING, "configure_logging": False}
     local: dict[str, Any] = {}
     if how.address == "local":
@@ -216,19 +181,10 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
         ray.init(address=how.address, **local, **quiet)
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         log.info("Ray: %d nodes, %d cores", len(nodes), ray.cluster_resources().get("CPU", 0))
-        if not any(
-            has.get("CPU", 0) >= how.cpus
-            and has.get("GPU", 0) >= how.gpus
-            and has.get("memory", 0) >= how.memory_bytes
-            for has in nodes
-        ):  # Ray would wait for ever
-            raise ConfigError(
-                f"no node of the cluster has cpus={how.cpus:g}, gpus={how.gpus:g} and "
-                f"memory_gb={how.memory_gb or 0:g}"
-            )
+        asked = {"CPU": how.cpus, "GPU": how.gpus, "memory": how.memory_bytes}
+        # Else Ray would wait for ever.
+        if not any(all(has.get(k, 0) >= n for k, n in asked.items()) for has in nodes):
+            raise ConfigError(f"no node of the cluster has what a task asks for: {asked}")
         yield
     finally:
         ray.shutdown()
-        for name, value in kept.items():
-            if value is None:
-                os.environ.pop(name, None)

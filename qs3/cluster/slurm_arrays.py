@@ -11,12 +11,10 @@ import logging
 import os
 import pickle
 import signal
-import struct
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
@@ -31,7 +29,6 @@ log = logging.getLogger(__name__)
 
 _STOP_S = 10.0
 _GRACE_S = 600.0
-_LENGTH = struct.Struct("<Q")
 
 
 @settings
@@ -116,18 +113,15 @@ class SlurmArrays:
         import submitit
 
         executor = submitit.AutoExecutor(folder=Path(self.folder).absolute(), cluster=self.cluster)
-        given: dict[str, Any] = {
-            "timeout_min": self.time_limit_min,
-            "cpus_per_task": self.cpus,
-            "mem_gb": self.memory_gb,
-            "name": "qs3",
-            "slurm_array_parallelism": self.jobs,
-        }
-        if self.partition:
-            given["slurm_partition"] = self.partition
-        if self.setup:
-            given["slurm_setup"] = list(self.setup)
-        executor.update_parameters(**given)
+        executor.update_parameters(
+            name="qs3",
+            timeout_min=self.time_limit_min,
+            cpus_per_task=self.cpus,
+            mem_gb=self.memory_gb,
+            slurm_array_parallelism=self.jobs,
+            slurm_partition=self.partition,
+            slurm_setup=list(self.setup) or None,
+        )
         return executor
 
     def _submit(
@@ -137,16 +131,14 @@ class SlurmArrays:
             return []
         folder = Path(self.folder).absolute()
         folder.mkdir(parents=True, exist_ok=True)
-        journals = [folder / f"journal-{os.urandom(8).hex()}" for _ in chunks]
-        with _interruptible(), executor.batch():
-            handles = [
-                executor.submit(_do_chunk, make_worker, chunk, journal)
-                for chunk, journal in zip(chunks, journals, strict=True)
-            ]
-        return [
-            _Job(handle, chunk, journal)
-            for handle, chunk, journal in zip(handles, chunks, journals, strict=True)
-        ]
+        with executor.batch():
+            jobs = []
+            for chunk in chunks:
+                journal = folder / f"journal-{os.urandom(8).hex()}"
+                jobs.append(
+                    _Job(executor.submit(_do_chunk, make_worker, chunk, journal), chunk, journal)
+                )
+        return jobs
 
 
 @dataclass
@@ -180,7 +172,7 @@ class _Job:
         return True
 
     def new_outcomes(self) -> Iterator[Outcome[Any]]:
-        """What its journal has gained; a record that is being written is left for the next time."""
+        """What its journal has gained."""
         for name, found in self._records():
             self.begun_at = self.begun_at or time.monotonic()
             if found is None:
@@ -195,20 +187,17 @@ class _Job:
                 yield Outcome(name, value)
 
     def _records(self) -> Iterator[tuple[str, Any]]:
+        """New records; one that is still being written is left for the next time."""
         for path in self.files():
             with path.open("rb") as file:
                 file.seek(self.read.get(path, 0))
-                new = file.read()
-            at = 0
-            while len(new) - at >= _LENGTH.size:
-                (length,) = _LENGTH.unpack_from(new, at)
-                end = at + _LENGTH.size + length
-                if end > len(new):
-                    break
-                self.read[path] = self.read.get(path, 0) + end - at
-                record = pickle.loads(new[at + _LENGTH.size : end])  # by a job of ours
-                at = end
-                yield record
+                while True:
+                    try:
+                        record = pickle.load(file)  # by a job of ours
+                    except (EOFError, pickle.UnpicklingError):
+                        break
+                    self.read[path] = file.tell()
+                    yield record
 
     def unfinished(self, deaths: Counter[str]) -> list[tuple[str, Any]]:
         """What is to be done again; the task during which the job ended is charged for it."""
@@ -216,31 +205,11 @@ class _Job:
         if left:
             guilty = self.begun or left[0][0]  # before its first task: all would end as that one
             deaths[guilty] += 1
-            log.warning("%s: its job ended early (%s)", guilty, self._why())
+            why = None
+            with suppress(Exception):
+                why = self.handle.exception()
+            log.warning("%s: its job ended early (%s)", guilty, why or "no reason is known")
         return left
-
-    def _why(self) -> str:
-        with suppress(Exception):
-            error = self.handle.exception()
-            return " ".join(str(error).split())[:200] if error else "no reason is known"
-        return "no reason is known"
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Processes that start meanwhile end at SIGINT, by which submitit cancels this machine's.
-
-    A command that a script runs by `&` ignores it, and so would they.
-    """
-    ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    if not ignored or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, lambda *_: None)  # ignored still, but handlers are not inherited
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _cancel(jobs: list[_Job], wait_s: float) -> None:
@@ -262,8 +231,7 @@ def _do_chunk(make_worker: Callable[[], Any], chunk: list[tuple[str, Any]], jour
     with own.open("xb", buffering=0) as file:
 
         def note(name: str, found: tuple[bool, Any] | None) -> None:
-            record = pickle.dumps((name, found))
-            file.write(_LENGTH.pack(len(record)) + record)
+            file.write(pickle.dumps((name, found)))
 
         work = None
         for name, task in chunk:

@@ -60,7 +60,7 @@ def config_sha256(cfg: DictConfig) -> str:
             plain[group]["sha256"] = cfg[group].sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
-    plain.setdefault("callbacks", {})  # ~callbacks is callbacks.progress=null
+    plain.setdefault("callbacks", {})  # ~callbacks leaves nothing out
     plain = _with_values(plain, cfg, "", _FROM_OUTSIDE)
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None

@@ -56,8 +56,7 @@ class Clock(Callback):
     """Time and memory, counted on from the checkpoint that a run continues.
 
     What was done between a checkpoint and a kill is done again, and counts once. A warm-up that was
-    taken from another run (`qs3.training.shared_warmup`) brings its time along: the sum is what
-    the run would have taken alone, up to the speed of the machine.
+    taken from another run brings its time along.
 
     Args:
         began: this start, before the data were loaded.

@@ -21,12 +21,9 @@ from qs3.models.base import Backbone, PointClassifier
 from qs3.utils.seeding import derive
 
 # `qs3.engine.loggers.EpochRows` hands the figures on, before the checkpoint is written.
-_PER_EPOCH: dict[str, Any] = {
-    "on_step": False,
-    "on_epoch": True,
-    "logger": False,
-    "sync_dist": True,
-}
+_PER_EPOCH: dict[str, Any] = dict(
+    on_step=False, on_epoch=True, logger=False, prog_bar=True, sync_dist=True
+)
 
 
 class Classifier(LightningModule):
@@ -40,12 +37,12 @@ class Classifier(LightningModule):
         student: loss of the rounds.
         phases: which epoch belongs to which phase; each phase has its own schedule.
         seed: of the run.
-        schedule: of the learning rate, see `qs3.engine.classifier`.
+        schedule: of the learning rate, "cosine" or "plateau".
         smoothing: of class labels, see `qs3.methods.base.class_loss`.
         metres: whether clouds keep their size.
         regulariser_weight: of what a backbone wants in the loss (`Features.regulariser`).
         weights: of the net, to begin with; None: new ones.
-        cuda_graphs: whether one GPU replays passes as graphs, see `qs3.engine.cuda_graphs`.
+        cuda_graphs: whether one GPU replays passes as graphs.
     """
 
     def __init__(
@@ -72,7 +69,7 @@ class Classifier(LightningModule):
         self.method, self.student = method, student
         method.smoothing = student.smoothing = smoothing
         method.metres = student.metres = metres
-        self._plateau: Plateau | None = None
+        self._plateau: ReduceLROnPlateau | None = None
         self._loaded_plateau: dict[str, Any] | None = None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive(seed, "heads"))
@@ -100,10 +97,18 @@ class Classifier(LightningModule):
     def configure_optimizers(self) -> Any:
         """One optimiser, one schedule."""
         optimizer = self._optimizer()
-        if self.schedule == "plateau":
-            self._plateau = Plateau(optimizer)
-            return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": cosine(optimizer, self.phases)}
+        if self.schedule == "cosine":
+            return {
+                "optimizer": optimizer,
+                "lr_scheduler": LambdaLR(optimizer, self.phases.cosine),
+            }
+        for group in optimizer.param_groups:
+            group["initial_lr"] = group["lr"]
+        self._plateau = plateau(optimizer)
+        if self._loaded_plateau is not None:
+            self._plateau.load_state_dict(self._loaded_plateau)
+            self._loaded_plateau = None
+        return optimizer
 
     def learning_rate(self) -> float:
         """The rate of the epoch that is ending, before the hook below."""
@@ -114,7 +119,7 @@ class Classifier(LightningModule):
         return float(optimizer.defaults["lr"] * self.phases.cosine(self.current_epoch))
 
     def on_train_epoch_end(self) -> None:
-        """The plateau's step, before the epoch's checkpoint."""
+        """Step the plateau by hand: Lightning would do so after the epoch's checkpoint."""
         if self._plateau is not None:
             self._plateau.step(float(self.trainer.callback_metrics["train/loss"]))
 
@@ -124,24 +129,19 @@ class Classifier(LightningModule):
             checkpoint["plateau"] = self._plateau.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep it until there is a plateau."""
+        """Keep it until there is a plateau: optimisers are made later."""
         self._loaded_plateau = checkpoint.get("plateau")
 
     def on_train_start(self) -> None:
-        """Give the plateau its memory back; the net is on its device by now."""
-        if self.cuda_graphs and self._takes_graphs():
-            assert isinstance(self.net, PointClassifier)
+        """Make graphs where passes are on one GPU; a frozen backbone's go through the host."""
+        on_one_gpu = self.device.type == "cuda" and self.trainer.world_size == 1
+        if (
+            self.cuda_graphs
+            and on_one_gpu
+            and isinstance(self.net, PointClassifier)
+            and any(p.requires_grad for p in self.net.backbone.parameters())
+        ):
             self._graphs = Graphs(self.net)
-        if self._plateau is not None and self._loaded_plateau is not None:
-            self._plateau.load_state_dict(self._loaded_plateau)
-            self._loaded_plateau = None
-
-    def _takes_graphs(self) -> bool:
-        """Whether passes are on one GPU; a frozen backbone's go through the host."""
-        trained = isinstance(self.net, PointClassifier) and any(
-            p.requires_grad for p in self.net.backbone.parameters()
-        )
-        return self.device.type == "cuda" and self.trainer.world_size == 1 and trained
 
     def on_train_end(self) -> None:
         """Graphs keep memory."""
@@ -174,15 +174,15 @@ class Classifier(LightningModule):
         if not keep_moments:
             optimizer.state.clear()
         if self._plateau is not None:
-            self._plateau.start_phase()
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"]
+            self._plateau = plateau(optimizer)
 
     def on_train_epoch_start(self) -> None:
         """Reseed torch (dropout draws from it): an epoch is a function of (seed, epoch).
 
         In the warm-up the method prepares its epoch.
         """
-        if self._graphs is not None:
-            self._graphs.begin_epoch()
         if self.phases.phase(self.current_epoch) == 0:
             torch.manual_seed(derive(self.seed, "start", self.current_epoch, self.global_rank))
             data = self.trainer.datamodule  # type: ignore[attr-defined]
@@ -201,7 +201,8 @@ class Classifier(LightningModule):
             self._graphs.begin_step()
             net = self._graphs.stand_in
         begins = batch_idx % self.trainer.accumulate_grad_batches == 0
-        told = {"progress": self._progress(batch_idx), "step_begins": begins}
+        done = self.current_epoch + (batch_idx + 1) / int(self.trainer.num_training_batches)
+        told = {"progress": min(done / self.phases.warmup, 1.0), "step_begins": begins}
         terms = method.loss(net, {**batch, **told}, generator)
         total = total_loss(method, terms)
         if self._regularisers:
@@ -215,11 +216,6 @@ class Classifier(LightningModule):
     def _keep_regulariser(self, _: nn.Module, __: Any, features: Any) -> None:
         if features.regulariser is not None and torch.is_grad_enabled():
             self._regularisers.append(features.regulariser)
-
-    def _progress(self, batch_idx: int) -> float:
-        """Part of the warm-up that is done after this step, in (0, 1]; 1 in the rounds."""
-        done = self.current_epoch + (batch_idx + 1) / int(self.trainer.num_training_batches)
-        return min(done / self.phases.warmup, 1.0)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Count the hits on held-out labelled clouds."""
@@ -235,49 +231,6 @@ class Classifier(LightningModule):
         self.log(f"{self.method.labels}_val/acc", accuracy, **_PER_EPOCH)
 
 
-PLATEAU_FACTOR, PLATEAU_PATIENCE, PLATEAU_MIN_LR = 0.5, 10, 1e-5
-
-
-class Plateau:
-    """Steps by hand at the end of an epoch: Lightning would step after the epoch's checkpoint.
-
-    Args:
-        optimizer: with the rates to begin with.
-    """
-
-    def __init__(self, optimizer: Optimizer) -> None:
-        self.optimizer = optimizer
-        self._rates = [group["lr"] for group in optimizer.param_groups]
-        self._restart()
-
-    def _restart(self) -> None:
-        self._scheduler = ReduceLROnPlateau(
-            self.optimizer,
-            factor=PLATEAU_FACTOR,
-            patience=PLATEAU_PATIENCE,
-            min_lr=PLATEAU_MIN_LR,
-        )
-
-    def start_phase(self) -> None:
-        """The first rates again, and no memory of losses."""
-        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
-            group["lr"] = rate
-        self._restart()
-
-    def step(self, loss: float) -> None:
-        """At the end of an epoch with this mean training loss."""
-        self._scheduler.step(loss)
-
-    def state_dict(self) -> dict[str, Any]:
-        """What a resume needs besides the optimiser's state, which holds the rates."""
-        known = self._scheduler.state_dict()
-        return {key: known[key] for key in ("best", "num_bad_epochs", "cooldown_counter")}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore `state_dict`."""
-        self._scheduler.load_state_dict(state)
-
-
-def cosine(optimizer: Optimizer, phases: Phases) -> LambdaLR:
-    """The half cosine of each phase, stepped by Lightning."""
-    return LambdaLR(optimizer, phases.cosine)
+def plateau(optimizer: Optimizer) -> ReduceLROnPlateau:
+    """Half the rate after eleven epochs without a lower loss, as SimpleView's code has it."""
+    return ReduceLROnPlateau(optimizer, factor=0.5, patience=10, min_lr=1e-5)

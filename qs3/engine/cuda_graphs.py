@@ -30,8 +30,7 @@ log = logging.getLogger(__name__)
 Pass = Callable[[Tensor], tuple[Tensor, ...]]
 Capture = Callable[[nn.Module, Tensor], Pass]
 EAGER = 8
-"""How often a pass is made as usual before it is captured, which costs as much as some of them, and
-is done where it has come in this epoch before: an epoch's last, smaller batch comes once."""
+"""How often a pass is made as usual before it is captured, which costs as much as some of them."""
 MOST = 16
 """Graphs of one module: each keeps its activations in memory."""
 _KNOWN = 256
@@ -64,32 +63,23 @@ class Graphs:
         self.whole, self.backbone = _Passes(self, net), _Passes(self, net.backbone)
         self.stand_in = _stand_in(net, self.whole, self.backbone)
 
-    def begin_epoch(self) -> None:
-        """What came in an epoch before is known to come, but how often in one is not."""
-        for passes in (self.whole, self.backbone):
-            passes.lately.clear()
-
     def begin_step(self) -> None:
         """The next pass is its step's first."""
         self.whole.place = self.backbone.place = 0
 
     def forget(self) -> None:
         """Give the graphs' memory back: other shapes come."""
-        had = bool(self.whole.graphs or self.backbone.graphs)
         for passes in (self.whole, self.backbone):
-            for kept in (passes.seen, passes.lately, passes.graphs):
-                kept.clear()
-        if had:
-            gc.collect()  # what torch makes of a pass is a class, which refers to itself
-            if torch.cuda.is_available():
-                torch.cuda.empty_cache()  # a graph's memory serves no other
+            passes.seen.clear()
+            passes.graphs.clear()
+        gc.collect()  # what torch makes of a pass is a class, which refers to itself
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()  # a graph's memory serves no other
 
     def give_up(self, error: Exception) -> None:
         """Go on without graphs, also those there are: they know torch's generator as it was."""
         self.off = True
         self.forget()
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
         why = str(error).split("\n", 1)[0]
         log.warning("no CUDA graphs of this net, steps go on without (%s)", why)
 
@@ -130,7 +120,6 @@ class _Passes:
         self.parts: _Parts | None = None
         self.place = 0
         self.seen: Counter[Hashable] = Counter()
-        self.lately: set[Hashable] = set()
         self.graphs: dict[Hashable, _Graph] = {}
 
     def __call__(self, points: Tensor) -> Any:
@@ -140,25 +129,18 @@ class _Passes:
         self.place += 1
         shown = points.shape, points.stride(), points.dtype
         key = (self.place, *shown, fast.is_plain(), self.parts.state())
-        graph = self.graphs.get(key)
-        if graph is None:
-            if not self._comes_often(key) or len(self.graphs) == MOST:
+        if key not in self.graphs:
+            if len(self.seen) > _KNOWN:  # sizes that are drawn anew each step
+                self.seen.clear()
+            self.seen[key] += 1
+            if self.seen[key] <= EAGER or len(self.graphs) == MOST:
                 return self.module(points)
             try:
-                graph = _Graph(self.module, points, self.of.capture)
+                self.graphs[key] = _Graph(self.module, points, self.of.capture)
             except Exception as error:
                 self.of.give_up(error)
                 return self.module(points)
-            self.graphs[key] = graph
-        return graph(points)
-
-    def _comes_often(self, key: Hashable) -> bool:
-        again = key in self.lately
-        if len(self.seen) > _KNOWN:  # sizes that are drawn anew each step
-            self.seen.clear()
-        self.seen[key] += 1
-        self.lately.add(key)
-        return again and self.seen[key] > EAGER
+        return self.graphs[key](points)
 
     def _can_be_captured(self, points: Tensor) -> bool:
         if (
@@ -170,21 +152,16 @@ class _Passes:
             return False
         if self.parts is None:
             self.parts = _Parts(self.module)
-        return self.parts.are_there() and not self.parts.have_hooks()
+        return self.parts.are_there() and not any(self.parts.hooks)
 
 
 class _Parts:
-    """What a module consists of: by name and identity, as graphs know tensors by their place."""
+    """What a module consists of: graphs know tensors by their place in memory."""
 
     def __init__(self, module: nn.Module) -> None:
         modules = list(module.modules())
-        self.slots = [
-            slots for m in modules for slots in (m._parameters, m._buffers, m._modules) if slots
-        ]
-        self.filled: list[tuple[Any, str, Any]] = [
-            (slots, name, part) for slots in self.slots for name, part in slots.items()
-        ]
-        self.sizes = [len(slots) for slots in self.slots]
+        self.slots = [slots for m in modules for slots in (m._parameters, m._buffers, m._modules)]
+        self.filled = self._now()
         self.weights = list(module.parameters())
         plain = (bool, int, float, str, type(None))
         self.values = [
@@ -192,13 +169,12 @@ class _Parts:
         ]
         self.hooks = [vars(m)[kind] for m in modules for kind in _HOOKS]
 
+    def _now(self) -> list[Any]:
+        return [part for slots in self.slots for part in slots.values()]
+
     def are_there(self) -> bool:
         """Whether each is still the one it was, and none has come."""
-        same = all(slots.get(name) is part for slots, name, part in self.filled)
-        return same and [len(slots) for slots in self.slots] == self.sizes
-
-    def have_hooks(self) -> bool:
-        return any(self.hooks)
+        return [*map(id, self._now())] == [*map(id, self.filled)]
 
     def state(self) -> tuple[Hashable, ...]:
         """Every number and word of the modules, and which weights are trained."""
@@ -254,8 +230,6 @@ class _Tensors(nn.Module):
 
     def forward(self, points: Tensor) -> tuple[Tensor, ...]:
         leaves, spec = tree_flatten(self.module.forward(points))
-        if not all(leaf is None or isinstance(leaf, Tensor) for leaf in leaves):
-            raise TypeError(f"{type(self.module).__name__} returns more than tensors and None")
         self.spec = spec, [leaf is not None for leaf in leaves]
         return tuple(leaf for leaf in leaves if leaf is not None)
 
@@ -287,7 +261,9 @@ def captured(module: nn.Module, points: Float[Tensor, "b n 3"]) -> Pass:
                 run, (points.clone(), *leaves), allow_unused_input=True
             )
     except Exception:
-        _new_generator(points.device)
+        # A capture that failed leaves torch's generator waiting for its end.
+        generator = torch.cuda.default_generators[points.device.index or 0]
+        generator.graphsafe_set_state(torch.Generator(points.device).graphsafe_get_state())
         raise
     finally:
         with torch.no_grad():
@@ -315,9 +291,3 @@ def _capturing(device: torch.device) -> Iterator[None]:
         warnings.filterwarnings("ignore", message="The AccumulateGrad node's stream does not match")
         warnings.filterwarnings("error", message="The CUDA Graph is empty")
         yield
-
-
-def _new_generator(device: torch.device) -> None:
-    """A capture that failed leaves torch's generator waiting for its end; it gets another state."""
-    generator = torch.cuda.default_generators[device.index or 0]
-    generator.graphsafe_set_state(torch.Generator(device).graphsafe_get_state())

@@ -4,10 +4,9 @@
 
 The objective is a validator of `qs3.evaluation`: accuracy is refused, and so is to vary what says
 how runs are judged (`check_varied`). The study lies in a file next to the runs, so that the same
-command goes on with it: trials that have finished are not repeated, those that failed or were
-interrupted are tried again. One that diverged is a poor trial, not a failed one. What Optuna draws
-for a trial follows from (seed, number of the trial): an interrupted search proposes what an
-uninterrupted one would have.
+command goes on with it. A trial that failed or was interrupted stays open: it is run again, first
+of all. One that diverged is a poor trial, and finished. What Optuna draws for a trial follows from
+(seed, number of the trial): an interrupted search proposes what an uninterrupted one would have.
 """
 
 from __future__ import annotations
@@ -18,9 +17,8 @@ import math
 import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import (
@@ -32,15 +30,14 @@ from hydra.core.override_parser.types import (
 )
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, open_dict
 
 from qs3.config import hashing
 from qs3.config.compose import quoted
 from qs3.config.location import typed
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
-from qs3.sweeps.listed_jobs import ListedJobs, OverLauncher
-from qs3.sweeps.ray_launcher import RayLauncher
+from qs3.sweeps.plugins import ListedJobs, OverLauncher, RayLauncher
 from qs3.training.provenance import check_finished
 from qs3.utils.locks import locked
 from qs3.utils.text_table import aligned
@@ -48,13 +45,10 @@ from qs3.utils.text_table import aligned
 if TYPE_CHECKING:
     from optuna import Study
     from optuna.distributions import BaseDistribution
-    from optuna.trial import Trial
+    from optuna.trial import FrozenTrial, Trial
 
 VARIED = ("method", "model", "protocol", "selftraining")
 """First words of the keys that may differ between runs of which an objective chooses one."""
-
-FAILED = "failed"
-_AGAIN = "again"  # of a trial: the number of the one that it repeats
 
 
 class LabelFreeSearch(OverLauncher):
@@ -71,33 +65,32 @@ class LabelFreeSearch(OverLauncher):
     """
 
     def __init__(
-        self, params: Mapping[str, Any], trials: int, at_once: int, seed: int, random: int,
-        folder: str,
-    ) -> None:  # fmt: skip
-        self.params = dict(params)
+        self, params: dict[str, Any], trials: int, at_once: int, seed: int, random: int, folder: str
+    ) -> None:
+        super().__init__()
+        self.params, self.folder = params, Path(folder)
         self.trials, self.at_once, self.seed, self.random = trials, at_once, seed, random
-        self.folder = Path(folder)
 
     def run(self, arguments: list[str]) -> list[JobReturn]:
         """Search until there are as many trials as were asked for; print the report."""
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        loader = self.hydra_context.config_loader
-        fixed, searched = split(arguments, self.params, OverridesParser.create(loader))
-        cfg = loader.load_sweep_config(self.config, list(fixed))
+        assert self.hydra_context is not None
+        parser = OverridesParser.create(self.hydra_context.config_loader)
+        fixed, searched = split(arguments, self.params, parser)
+        cfg = self._composed(fixed)
         if cfg.objective is None:
             raise ConfigError("a search needs an objective, such as objective=infomax")
         space = {key: distribution(one) for key, one in searched.items()}
         study = self._study(cfg, space)
         lock = self.file.with_name(f".{self.file.stem}.lock")
         with locked(lock, f"another process is searching in {self.file}"):
-            # A trial without an end was interrupted: the lock says that nobody runs it now.
             self._refuse_changed(study, fixed)
-            _try_again(study)
             done = self._until_enough(study, fixed, space)
         headline = f"Search by {cfg.objective}, which needs no labels; the study is {self.file}"
-        sys.stdout.write(report(headline, cfg.objective, _tried(study), fixed) + "\n")
+        tried = [_tried(trial) for trial in _trials(study)]
+        sys.stdout.write(report(headline, cfg.objective, tried, fixed) + "\n")
         for result in done:
             _ = result.return_value  # raises if the job failed
         return done
@@ -105,33 +98,52 @@ class LabelFreeSearch(OverLauncher):
     def _until_enough(
         self, study: Study, fixed: Sequence[str], space: Mapping[str, BaseDistribution]
     ) -> list[JobReturn]:
-        """Ask for trials, launch them and tell the study, until it has as many as it should."""
+        """Launch open trials, then new ones, and tell the study, until it has as many as asked."""
+        from optuna.trial import Trial, TrialState
+
+        # The lock says that nobody runs an open trial now.
+        again: list[Trial] = []
+        for trial in study.get_trials(states=(TrialState.RUNNING,)):
+            if trial.params.keys() == space.keys():
+                again.append(Trial(study, trial._trial_id))
+            else:  # killed while it was asked for
+                study.tell(trial.number, state=TrialState.FAIL)
         done: list[JobReturn] = []
-        while (left := self.trials - _count(study)) > 0 or _any(study, "WAITING"):
-            batch = [self._ask(study, space) for _ in range(min(self.at_once, max(left, 1)))]
-            jobs = [[*fixed, *overrides(words(trial.params))] for trial in batch]
+        while True:
+            batch, again = again[: self.at_once], again[self.at_once :]
+            while len(batch) < self.at_once and len(_trials(study)) < self.trials:
+                batch.append(self._ask(study, space))
+            if not batch:
+                return done
+            jobs = [[*fixed, *_overrides(words(asked.params))] for asked in batch]
             results = self.launch(jobs, batch[0].number)
-            for trial, result in zip(batch, results, strict=True):
-                _tell(study, trial, result)
+            for asked, result in zip(batch, results, strict=True):
+                _tell(study, asked, result)
             done += results
             failed = all(result.status != JobStatus.COMPLETED for result in results)
-            if failed and not _any(study, "COMPLETE"):
-                break  # e.g. no data: the next would end like these
-        return done
+            if failed and not study.get_trials(states=(TrialState.COMPLETE,)):
+                return done  # e.g. no data: the next would end like these
 
     def _refuse_changed(self, study: Study, fixed: Sequence[str]) -> None:
         """Raise if the study's runs were trained on other data, or on another classifier.
 
-        Objectives of two datasets say nothing about settings. One run stands for all.
+        Objectives of two datasets cannot be compared. One run stands for all.
         """
         from optuna.trial import TrialState
 
-        loader = self.hydra_context.config_loader
-        for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
-            one = loader.load_sweep_config(self.config, [*fixed, *overrides(words(trial.params))])
-            one = OmegaConf.masked_copy(one, [str(key) for key in one if key != "hydra"])
-            if check_finished(one, "or begin another search with another experiment_name"):
+        for trial in study.get_trials(states=(TrialState.COMPLETE,)):
+            cfg = self._composed([*fixed, *_overrides(words(trial.params))])
+            if check_finished(cfg, "or begin another search with another experiment_name"):
                 return
+
+    def _composed(self, overrides: Sequence[str]) -> DictConfig:
+        """The config of a job."""
+        assert self.hydra_context is not None
+        assert self.config is not None
+        cfg = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
+        with open_dict(cfg):
+            del cfg["hydra"]
+        return cfg
 
     def _study(self, cfg: DictConfig, space: Mapping[str, BaseDistribution]) -> Study:
         from optuna import create_study
@@ -153,9 +165,11 @@ class LabelFreeSearch(OverLauncher):
     def _ask(self, study: Study, space: Mapping[str, BaseDistribution]) -> Trial:
         from optuna.samplers import TPESampler
 
-        # Trials that are still running count as poor ones, so that those of a batch differ.
+        # Open trials count as poor ones, so that those of a batch differ.
         study.sampler = TPESampler(
-            seed=self.seed + 1000 * _count(study), n_startup_trials=self.random, constant_liar=True
+            seed=self.seed + 1000 * len(_trials(study)),
+            n_startup_trials=self.random,
+            constant_liar=True,
         )
         return study.ask(dict(space))
 
@@ -192,22 +206,14 @@ def check_varied(varied: Iterable[Override]) -> None:
 
 
 def distribution(one: Override) -> BaseDistribution:
-    """What Optuna calls a sweep of Hydra's: whole numbers if both ends are.
-
-    Raises:
-        ValueError: Optuna's, for ends or values that cannot be.
-    """
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+    """A sweep of Hydra's as a distribution of Optuna's: whole numbers if both ends are."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     sweep: Any = one.value()
-    if isinstance(sweep, ChoiceSweep):
-        plain = [each.text if isinstance(each, QuotedString) else each for each in sweep.list]
-        return CategoricalDistribution(plain)  # type: ignore[arg-type]
     more: dict[str, Any] = {}
+    if isinstance(sweep, ChoiceSweep):
+        plain: Any = [each.text if isinstance(each, QuotedString) else each for each in sweep.list]
+        return CategoricalDistribution(plain)
     if isinstance(sweep, IntervalSweep):
         low, high, more["log"] = sweep.start, sweep.end, "log" in sweep.tags
     elif isinstance(sweep, RangeSweep):
@@ -215,38 +221,32 @@ def distribution(one: Override) -> BaseDistribution:
         low, high, more["step"] = values[0], round(values[-1], 10), sweep.step
     else:
         raise ConfigError(f"cannot search {one.input_line}; write interval, range or choice")
-    if isinstance(low, int) and isinstance(high, int):
-        return IntDistribution(low, high, **more)
-    return FloatDistribution(float(low), float(high), **more)  # type: ignore[arg-type]
+    whole = isinstance(low, int) and isinstance(high, int)
+    return (IntDistribution if whole else FloatDistribution)(low, high, **more)  # type: ignore[arg-type]
 
 
 def words(params: Mapping[str, Any]) -> dict[str, str]:
     """A trial's values in Hydra's grammar: numbers with six digits, text quoted if need be."""
-    return {
-        key: quoted(one) if isinstance(one, str) else _plain(one) for key, one in params.items()
-    }
+    plain = {None: "null", True: "true", False: "false"}
+
+    def word(value: Any) -> str:
+        if value is None or isinstance(value, bool):
+            return plain[value]
+        if isinstance(value, str):
+            return quoted(value)
+        return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+    return {key: word(value) for key, value in params.items()}
 
 
-def _plain(value: Any) -> str:
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def overrides(words: Mapping[str, str]) -> list[str]:
-    """The words of a command line."""
+def _overrides(words: Mapping[str, str]) -> list[str]:
     return [f"{key}={word}" for key, word in words.items()]
 
 
-@dataclass(frozen=True)
-class Tried:
-    """A trial.
+class Tried(NamedTuple):
+    """A trial: its number, by key what was varied in Hydra's grammar, objective and run.
 
-    Attributes:
-        number: of the trial.
-        params: by key what was varied, in Hydra's grammar.
-        value: of the objective; None if it failed or diverged.
-        run: the name of its run, "failed" or "diverged: <name>".
+    The objective is None if it failed, and NaN if it diverged.
     """
 
     number: int
@@ -254,84 +254,55 @@ class Tried:
     value: float | None
     run: str
 
-    @staticmethod
-    def of(number: int, params: Mapping[str, str], value: float | None, run: str) -> Tried:
-        """A trial with what its run returned: None if that failed, NaN if it diverged."""
-        if value is None:
-            return Tried(number, params, None, FAILED)
-        if not math.isfinite(value):
-            return Tried(number, params, None, f"diverged: {run}")
-        return Tried(number, params, value, run)
-
 
 def report(headline: str, objective: str, tried: Sequence[Tried], fixed: Sequence[str]) -> str:
     """A table of all trials, in order, without any accuracy; `fixed`: overrides that all share."""
     keys = list(dict.fromkeys(key for one in tried for key in one.params))
-    rows = [("trial", objective, *keys, "run")]
+    rows, judged = [("trial", objective, *keys, "run")], []
     for one in tried:
-        value = "-" if one.value is None else f"{one.value:.4f}"
+        value, run = "-", "failed" if one.value is None else f"diverged: {one.run}"
+        if one.value is not None and math.isfinite(one.value):
+            value, run = f"{one.value:.4f}", one.run
+            judged.append((one.value, one))
         values = (one.params.get(key, "-") for key in keys)
-        rows.append((str(one.number), value, *values, one.run))
+        rows.append((str(one.number), value, *values, run))
     lines = [headline, *aligned(rows)]
-    judged = [one for one in tried if one.value is not None]
     if judged:
         sign = 1 if LABEL_FREE[objective].higher_is_better else -1
-        best = max(judged, key=lambda one: sign * (one.value or 0.0))  # the first one wins a tie
+        _, best = max(judged, key=lambda pair: sign * pair[0])  # the first one wins a tie
         search = ("hparams_search=", "objective=", "seed=")
         kept = [word for word in fixed if not word.startswith(search)]
-        command = shlex.join([*kept, *overrides(best.params), "seed=0,1,2"])
+        command = shlex.join([*kept, *_overrides(best.params), "seed=0,1,2"])
         lines.append(f"Best: trial {best.number}. With several seeds:")
         lines.append(typed(f"  python train.py -m {command}"))
     return "\n".join(lines)
 
 
 def _tell(study: Study, trial: Trial, result: JobReturn) -> None:
+    """Close a trial whose run is finished. To TPE a pruned one, which diverged, is a poor one."""
     from optuna.trial import TrialState
 
-    value, run = None, ""
-    if result.status == JobStatus.COMPLETED:
-        value, run = float(result.return_value), hashing.run_name(result.cfg)  # type: ignore[arg-type]
-    one = Tried.of(trial.number, words(trial.params), value, run)
-    trial.set_user_attr("run", one.run)
-    if one.value is not None:
-        study.tell(trial, one.value)
-    else:  # a pruned trial is a poor one to TPE, and is not tried again: it would diverge again
-        study.tell(trial, state=TrialState.FAIL if value is None else TrialState.PRUNED)
+    if result.status != JobStatus.COMPLETED:
+        return
+    value, cfg = result.return_value, result.cfg
+    assert isinstance(value, float)
+    assert cfg is not None
+    trial.set_user_attr("run", hashing.run_name(cfg))
+    if math.isfinite(value):
+        study.tell(trial, value)
+    else:
+        study.tell(trial, state=TrialState.PRUNED)
 
 
-def _tried(study: Study) -> list[Tried]:
-    """The study's trials; of one that was repeated, the repetition."""
-    repeated = _repeated(study)
-    return [
-        Tried(trial.number, words(trial.params), trial.value, trial.user_attrs.get("run", FAILED))
-        for trial in study.trials
-        if trial.number not in repeated
-    ]
+def _tried(trial: FrozenTrial) -> Tried:
+    run = trial.user_attrs.get("run", "")
+    value = math.nan if run and trial.value is None else trial.value
+    return Tried(trial.number, words(trial.params), value, run)
 
 
-def _try_again(study: Study) -> None:
-    """Put trials that failed, or that an interruption left without an end, in the queue again."""
-    from optuna.trial import TrialState
-
-    repeated = _repeated(study)
-    for trial in study.trials:
-        if trial.state == TrialState.RUNNING:
-            study.tell(trial.number, state=TrialState.FAIL)
-        if trial.state in (TrialState.RUNNING, TrialState.FAIL) and trial.number not in repeated:
-            study.enqueue_trial(trial.params, user_attrs={_AGAIN: trial.number})
-
-
-def _repeated(study: Study) -> set[int]:
-    return {trial.user_attrs[_AGAIN] for trial in study.trials if _AGAIN in trial.user_attrs}
-
-
-def _count(study: Study) -> int:
-    """Trials so far; one that was repeated is one."""
-    return sum(_AGAIN not in trial.user_attrs for trial in study.trials)
-
-
-def _any(study: Study, state: str) -> bool:
-    return any(trial.state.name == state for trial in study.trials)
+def _trials(study: Study) -> list[FrozenTrial]:
+    """All but those that were killed while they were asked for."""
+    return [trial for trial in study.get_trials() if trial.state.name != "FAIL"]
 
 
 def register() -> None:

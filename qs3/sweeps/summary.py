@@ -72,12 +72,11 @@ class SummaryOfSeeds(Callback):
         """Note how the job has ended, and log what went wrong: Hydra shows the first error only."""
         if self.journal is None:
             return
-        returned = getattr(job_return, "_return_value", None)
-        text = ""
+        returned, text = getattr(job_return, "_return_value", None), ""
         if isinstance(returned, Exception):
-            first = str(returned).strip().partition("\n")[0]
-            told = isinstance(returned, CompactHydraException)  # its text begins with the kind
-            text = first if told else f"{type(returned).__name__}: {first}"
+            text = str(returned).strip().partition("\n")[0]
+            if not isinstance(returned, CompactHydraException):  # whose text begins with the kind
+                text = f"{type(returned).__name__}: {text}"
         if text and text not in (entry.get("error") for entry in self._read()):
             log.error("%s failed: %s", " ".join(job_return.overrides), text)
         value = returned if isinstance(returned, float) else None
@@ -151,9 +150,8 @@ def failures(jobs: Sequence[Mapping[str, Any]]) -> str:
 
 def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
     """By folder the overrides in which jobs differ, without the seed; "" if they do not."""
-    words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
-    keys = dict.fromkeys(key for one in words for key in one if key != "seed")
-    several = [key for key in keys if len({one.get(key) for one in words}) > 1]
+    words, keys = _varied(jobs)
+    several = [key for key in keys if key != "seed"]
     return {
         Path(job["folder"]): " ".join(f"{key}={one[key]}" for key in several if key in one)
         for job, one in zip(jobs, words, strict=True)
@@ -162,16 +160,25 @@ def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
 
 def objectives(jobs: Sequence[Mapping[str, Any]], name: str) -> str:
     """A table of the runs' objectives (each job's "value") and the best of them; no accuracy."""
-    jobs = sorted(jobs, key=lambda job: job["job"])
-    words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
-    varied = [key for key in words[0] if len({one.get(key) for one in words}) > 1]
-    tried = []
-    for job, one in zip(jobs, words, strict=True):
-        run = "/".join(Path(job["folder"]).parts[-2:])
-        params = {key: one[key] for key in varied}
-        tried.append(Tried.of(job["job"], params, job.get("value"), run))
-    fixed = [word for word in jobs[0]["overrides"] if word.partition("=")[0] not in varied]
+    words, keys = _varied(jobs)
+    tried = [
+        Tried(
+            job["job"],
+            {key: one[key] for key in keys},
+            job.get("value"),
+            "/".join(Path(job["folder"]).parts[-2:]),
+        )
+        for job, one in zip(jobs, words, strict=True)
+    ]
+    fixed = [word for word in jobs[0]["overrides"] if word.partition("=")[0] not in keys]
     return report(f"{name}, which needs no labels, of each run", name, tried, fixed)
+
+
+def _varied(jobs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, str]], list[str]]:
+    """Each job's overrides by key, and the keys in which they differ."""
+    words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
+    keys = dict.fromkeys(key for one in words for key in one)
+    return words, [key for key in keys if len({one.get(key) for one in words}) > 1]
 
 
 def _check_fair(config: DictConfig) -> None:

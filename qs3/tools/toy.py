@@ -89,7 +89,6 @@ def toy_overrides(root: str | Path) -> list[str]:
         "selftraining.theta=0.7",
         "selftraining.epsilon=0.05",
         "trainer.threads=1",
-        "callbacks.progress=null",
         "logger=csv",
         "report.pictures=false",
         override("paths.data_dir", root / "data"),

@@ -42,7 +42,8 @@ def train(cfg: DictConfig) -> RunMetrics:
             with _wandb_forgotten():
                 metrics = _fit(run)
                 write_metrics(run.folder, metrics)
-                _report(run)
+                # What `report` names, e.g. its pictures: training imports none.
+                build(cfg.report)(run.folder, OmegaConf.to_container(cfg, resolve=False))
         else:
             refuse_changed(run, metrics)
             edited = " and ".join(changed_files(read_code(run.folder)))
@@ -56,10 +57,7 @@ def train(cfg: DictConfig) -> RunMetrics:
 
 
 def objective_of(cfg: DictConfig, metrics: RunMetrics) -> float | None:
-    """What a search over hyper-parameters looks at; None if there is no search.
-
-    NaN for a run that has diverged: it is finished, and would diverge again.
-    """
+    """What a search looks at, NaN for a run that has diverged; None if there is no search."""
     if cfg.objective is None:
         return None
     value = metrics.validators[cfg.objective]
@@ -74,37 +72,24 @@ def judged(cfg: DictConfig, metrics: RunMetrics) -> str:
 
 
 def headline(metrics: RunMetrics) -> str:
-    """The result in one line; says what the data are made of, and when the target is simulated."""
-    final, run = metrics.final, f"{metrics.experiment}, seed {metrics.seed}: "
+    """The result in one line, with what the data are made of and how weights were selected."""
+    final, target = metrics.final, metrics.target_text
+    text = f"{metrics.experiment}, seed {metrics.seed}: "
     if metrics.diverged:
-        run += "the net has diverged, its predictions are no numbers; "
-    target = metrics.target_text
+        text += "the net has diverged, its predictions are no numbers; "
     if final.accuracy is None:
         counts = ", ".join(f"{name} {count}" for name, count in final.predicted.items() if count)
-        estimate = in_words(metrics.quality.expected)
-        return (
-            f"{run}no labels to judge {target} by; predicted {counts}"
-            f"{f'; {estimate}' if estimate else ''}; data: {metrics.data_text}{_chosen(metrics)}"
-        )
-    return (
-        f"{run}accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
-        f"on {target}, majority rate {final.majority_rate:.1%}{_told(metrics)}; "
-        f"data: {metrics.data_text}"
-        f"{_chosen(metrics)}"
-    )
-
-
-def _told(metrics: RunMetrics) -> str:
-    """That predictions were told how common classes are."""
-    return "; with evaluation.prior" if metrics.evaluation.prior else ""
-
-
-def _chosen(metrics: RunMetrics) -> str:
-    """How teacher and student were selected, for the end of the headline."""
+        text += f"no labels to judge {target} by; predicted {counts}"
+        text += f"; {estimate}" if (estimate := in_words(metrics.quality.expected)) else ""
+    else:
+        text += f"accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
+        text += f"on {target}, majority rate {final.majority_rate:.1%}"
+        text += "; with evaluation.prior" if metrics.evaluation.prior else ""
     teacher, student = map(chosen_in_words, (metrics.selection.teacher, metrics.selection.student))
+    chosen = f"teacher selected by {teacher}; student by {student}"
     if teacher == student:  # no rounds
-        return f"; selected by {teacher}"
-    return f"; teacher selected by {teacher}; student by {student}"
+        chosen = f"selected by {teacher}"
+    return f"{text}; data: {metrics.data_text}; {chosen}"
 
 
 def _fit(run: Run) -> RunMetrics:
@@ -113,14 +98,11 @@ def _fit(run: Run) -> RunMetrics:
 
         checkpoint_asked_for(run)
     check_or_make(run.source, run.target, run.cfg.data.make_source)
-    from qs3.training.fit import fit  # torch and Lightning from here on
+    from qs3.training.evaluate import evaluate  # torch and Lightning from here on
+    from qs3.training.fit import fit
 
-    return fit(run)
-
-
-def _report(run: Run) -> None:
-    """Hand the finished run to what `report` names, e.g. its pictures: training imports none."""
-    build(run.cfg.report)(run.folder, OmegaConf.to_container(run.cfg, resolve=False))
+    loaded, built = fit(run)
+    return evaluate(run, loaded, built)
 
 
 @contextlib.contextmanager

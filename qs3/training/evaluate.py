@@ -1,32 +1,56 @@
-"""Fourth stage: what the nets of a run are worth, from the weights that it saved."""
+"""Last stage: what the nets of a run are worth, from the weights that it saved; its result."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from omegaconf import OmegaConf
 from torch import nn
 
+from qs3.config import hashing
+from qs3.config.hydra import component_names
 from qs3.datamodules.clouds import Labelled
-from qs3.evaluation.expected import HeldOut, expected_accuracy, held_out
+from qs3.evaluation.expected import expected_accuracy, held_out
 from qs3.evaluation.metrics import predict, predict_rotated
 from qs3.evaluation.norms import adapt_norms, minimise_entropy
-from qs3.evaluation.ood import ood_share
+from qs3.evaluation.ood import limits, ood_reasons_of_all, ood_share, source_limits
 from qs3.evaluation.prior import Prior
 from qs3.evaluation.validators import LABEL_FREE, LAST, PSEUDO_VAL
-from qs3.runs.checkpoints import load, weights_sha256
-from qs3.runs.metrics import Quality, Scores, TrainingAccuracy
-from qs3.runs.predictions import Predictions
-from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
+from qs3.inference.model_file import FILE as RESULT
+from qs3.inference.model_file import Result, write_result
+from qs3.runs.checkpoints import copy_weights, load, weights_sha256
+from qs3.runs.metrics import (
+    DataHashes,
+    EpochScores,
+    Evaluated,
+    Loading,
+    Quality,
+    RunMetrics,
+    Selection,
+    StudentChoice,
+    TrainingAccuracy,
+    Warmup,
+)
+from qs3.runs.predictions import FILE as PREDICTIONS
+from qs3.runs.predictions import (
+    OF_FILES,
+    Predictions,
+    pseudo_labels_path,
+    write_predictions,
+    write_predictions_of_files,
+)
+from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, WarmupSelection
 from qs3.selftraining.student_selection import StudentSelection
-from qs3.training.build import Built
+from qs3.store.manifest import read_manifest
+from qs3.training.fit import Built
 from qs3.training.load import Loaded, Shares, prior_beside, shares_of_student
 from qs3.training.run import STUDENT, Run
 from qs3.utils.seeding import derive
@@ -42,41 +66,6 @@ ADAPTERS: dict[str, Callable[..., None]] = {
 """Values of `evaluation.norms` (`qs3.training.run.Judging`), beside "trained"."""
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What came of a run.
-
-    Attributes:
-        net: the reported one.
-        predictions: its, for each evaluated cloud; these and all scores are with
-            `evaluation.prior`, estimates and validators without.
-        prior: that one, of the reported net.
-        choice: what chose its epoch; None: it is the last one's, or the warm-up's.
-        final: its scores.
-        scores: of "selected" and "last", the warm-up's epochs, and "student", the last round's.
-        rotated: scores of the reported net and of "selected", averaged over rotations.
-        validators: its label-free scores.
-        quality: what can be said of it without labels.
-        held_out: what it is on held-out labelled clouds; None of one that has diverged, or whose
-            norms `evaluation.norms` changed.
-        learnt: shares of the classes in what it learnt from.
-        training: its accuracy on training clouds, with `data.clouds_a_class` alone.
-    """
-
-    net: nn.Module
-    predictions: Predictions
-    prior: Prior | None
-    choice: StudentSelection | None
-    final: Scores
-    scores: Mapping[str, Scores]
-    rotated: tuple[Scores | None, Scores | None]
-    validators: dict[str, float | None]
-    quality: Quality
-    held_out: HeldOut | None
-    learnt: Shares
-    training: TrainingAccuracy | None
-
-
 class SavedNets:
     """Nets with the weights in a run's files, and what they predict.
 
@@ -90,89 +79,70 @@ class SavedNets:
     """
 
     def __init__(self, run: Run, loaded: Loaded, built: Built) -> None:
-        self.run, self.data, self.test = run, loaded.data, loaded.evaluation.test
+        self.run, self.data = run, loaded.data
+        self.clouds = {
+            "test": loaded.evaluation.test,
+            "target": loaded.data.target,  # the training clouds
+            "validation": loaded.data.validation.clouds,
+        }
         self.classifier = built.classifier
         # After `fit` Lightning moves the classifier to the CPU; the accelerator is still there.
         self.device = built.trainer.strategy.root_device
-        self._weights: dict[Path, str] = {}
         self._nets: dict[tuple[str, str], nn.Module] = {}
-        self._predicted: dict[tuple[str, str, float], np.ndarray] = {}
+        self._predicted: dict[tuple[str, str, str, float], Float[np.ndarray, "n c"]] = {}
+        self._weights_in = cache(lambda file: weights_sha256(load(file)))  # equal ones are one net
 
-    def __call__(self, file: Path) -> nn.Module:
-        """As it is evaluated: with norms of the target if `evaluation.norms` says so."""
-        return self._net(file, self.run.cfg.evaluation.norms)
-
-    def of_test(
-        self, file: Path, turn: float = 0.0, norms: str | None = None
-    ) -> Float[np.ndarray, "n c"]:
-        """Probabilities of the evaluated clouds, rotated about the up axis by `turn` in radians.
-
-        `norms`: other ones than `evaluation.norms`.
-        """
+    def __call__(self, file: Path, norms: str | None = None) -> nn.Module:
+        """As it is evaluated: with norms of the target if `norms` or `evaluation.norms` says so."""
         norms = norms or self.run.cfg.evaluation.norms
-        key = self._weights_in(file), f"test, {norms}", turn
-        if key not in self._predicted:
-            more = self._net(file, norms), self.test.points
-            how: Any = self.run.cfg.data.eval_batch_size, self.device
-            found = predict_rotated(*more, turn, *how) if turn else predict(*more, *how)
-            self._predicted[key] = found
-        return self._predicted[key]
-
-    def of_target(self, file: Path) -> Float[np.ndarray, "n c"]:
-        """Probabilities of the target's training clouds."""
-        key = self._weights_in(file), "target", 0.0
-        if key not in self._predicted:
-            clouds, size = self.data.target.points, self.run.cfg.data.eval_batch_size
-            self._predicted[key] = predict(self(file), clouds, size, self.device)
-        return self._predicted[key]
-
-    def of_validation(self, file: Path, norms: str | None = None) -> Float[np.ndarray, "v c"]:
-        """Probabilities of the labelled validation clouds, with the norms for their domain.
-
-        `norms`: of clouds of the target other ones than `evaluation.norms`.
-        """
-        of_source, clouds = self.data.owner == "source", self.data.validation.clouds
-        norms = "trained" if of_source else norms or self.run.cfg.evaluation.norms
-        key = self._weights_in(file), f"validation, {norms}", 0.0
-        if key not in self._predicted:
-            self._predicted[key] = predict(
-                self._net(file, norms),
-                clouds.points,
-                self.run.cfg.data.eval_batch_size,
-                self.device,
-                domain="source" if of_source else "target",
-            )
-        return self._predicted[key]
-
-    def _net(self, file: Path, norms: str) -> nn.Module:
         key = self._weights_in(file), norms
         if key not in self._nets:
             net = self.classifier.fresh_net(phase=0).to(self.device)
             net.load_state_dict(load(file, self.device))
             if norms != TRAINED:
-                adapt = ADAPTERS[norms]
                 size, seed = self.run.cfg.protocol.batch_size, derive(self.run.seed, norms)
-                adapt(net, self.data.target.points, size, seed, self.device)
+                ADAPTERS[norms](net, self.data.target.points, size, seed, self.device)
             self._nets[key] = net
         return self._nets[key]
 
-    def _weights_in(self, file: Path) -> str:
-        """A hash of the weights: files of equal ones need not be equal."""
-        if file not in self._weights:
-            self._weights[file] = weights_sha256(load(file))
-        return self._weights[file]
+    def of(
+        self, which: str, file: Path, norms: str | None = None, turn: float = 0.0
+    ) -> Float[np.ndarray, "n c"]:
+        """Probabilities of "test", "target" or "validation" clouds, by norms for their domain.
+
+        Args:
+            which: of `clouds`.
+            file: with the weights.
+            norms: of clouds of the target other ones than `evaluation.norms`.
+            turn: about the up axis, in radians.
+        """
+        norms, domain = norms or self.run.cfg.evaluation.norms, "target"
+        if which == "validation" and self.data.owner == "source":
+            norms, domain = TRAINED, "source"
+        key = self._weights_in(file), which, norms, turn
+        if key not in self._predicted:
+            more = self(file, norms), self.clouds[which].points
+            how = self.run.cfg.data.eval_batch_size, self.device
+            self._predicted[key] = (
+                predict_rotated(*more, turn, *how) if turn else predict(*more, *how, domain=domain)
+            )
+        return self._predicted[key]
 
 
-def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
-    """Score the warm-up's and the student's weights; of the reported ones say more."""
-    nets, evaluation = SavedNets(run, loaded, built), loaded.evaluation
+def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
+    """Score the warm-up's and the student's weights; write the model file and the predictions.
+
+    Scores and predictions are with `evaluation.prior`, estimates and validators without.
+
+    Returns:
+        What `metrics.json` is to hold. The caller writes it last: it marks a run as finished.
+    """
+    cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
+    nets = SavedNets(run, loaded, built)
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
     choice = None if built.student.rule == LAST else built.student
-    last = "student" if run.scheme.rounds else "selected"
-    file = choice.file if choice else files[last]
-    net, device = nets(file), nets.device
-
+    file = choice.file if choice else files["student" if run.scheme.rounds else "selected"]
     learnt = loaded.learnt
     if run.scheme.rounds:
         learnt = shares_of_student(run.scheme, loaded.labelled, built.rounds.records[-1])
@@ -181,53 +151,109 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     def prior_of(weights: Path) -> Prior | None:
         # A given teacher learnt elsewhere, but the warm-up's last net from the labelled clouds.
         warmups = {files["selected"]: loaded.learnt, files["last"]: loaded.labelled}
-        met = warmups.get(weights, learnt)
-        said = partial(nets.of_target, weights)
-        return prior_beside(run.cfg.evaluation, evaluation.classes, met, said)
+        met, said = warmups.get(weights, learnt), partial(nets.of, "target", weights)
+        return prior_beside(cfg.evaluation, evaluation.classes, met, said)
 
     def reported(weights: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
-        found, prior = nets.of_test(weights, turn), prior_of(weights)
+        found, prior = nets.of("test", weights, turn=turn), prior_of(weights)
         return prior(found) if prior else found
 
+    scores = {name: evaluation.scores_of(reported(path)) for name, path in files.items()}
     predictions = evaluation.predictions_of(reported(file))
-    batch_size, data = run.cfg.data.eval_batch_size, loaded.data
-    return Outcome(
-        net=net,
-        predictions=predictions,
-        prior=prior_of(file),
-        choice=choice,
+    if built.trainer.is_global_zero:
+        _write(run, loaded, nets, file, learnt, predictions)
+    prior, called = prior_of(file), component_names(cfg)
+    return RunMetrics(
+        experiment=cfg.experiment_name,
+        hash=hashing.config_hash(cfg),
+        config_sha256=hashing.config_sha256(cfg),
+        seed=run.seed,
+        source=data.labelled_domain.domain.name,
+        target=run.target.name,
+        simulated=bool(run.target.simulated),
+        method=called["method"],
+        selftraining=called["selftraining"],
+        model=called["model"],
+        selection=_selection(run, loaded, built.warmup, choice),
+        loading=Loading(
+            points=cfg.data.points,
+            scale=cfg.data.scale,
+            fps_starts=data.labelled.clouds.starts,
+            sampler=cfg.data.sampler,
+        ),
         final=evaluation.scores_of(predictions.probabilities),
-        scores={name: evaluation.scores_of(reported(path)) for name, path in files.items()},
-        rotated=(
-            evaluation.rotation_averaged(partial(reported, file)),
-            evaluation.rotation_averaged(partial(reported, files["selected"])),
+        evaluation=Evaluated(
+            split=loaded.split,
+            labels=evaluation.labelled,
+            rotations=evaluation.rotations,
+            norms=cfg.evaluation.norms,
+            prior=prior.words if prior else "",
+            prior_shares=prior.shares if prior else None,
+            final_over_rotations=evaluation.rotation_averaged(partial(reported, file)),
+            warmup_over_rotations=evaluation.rotation_averaged(
+                partial(reported, files["selected"])
+            ),
+            tiers=evaluation.scores_of_tiers(predictions.probabilities),
         ),
-        validators=without_labels(nets.of_target(file), choice),
+        warmup=Warmup(
+            selected=EpochScores(epoch=built.warmup.epoch, scores=scores["selected"]),
+            last=EpochScores(epoch=run.phases.warmup - 1, scores=scores["last"]),
+        ),
+        rounds=[
+            replace(
+                record,
+                with_target_labels=evaluation.pseudo_labels(
+                    pseudo_labels_path(run.folder, record.round)
+                ),
+            )
+            for record in built.rounds.records
+        ],
+        student=None
+        if choice is None
+        else StudentChoice(
+            **choice.record(),
+            last=EpochScores(epoch=run.phases.total - 1, scores=scores["student"]),
+        ),
+        validators=without_labels(nets.of("target", file), choice),
         quality=_quality(run, loaded, nets, file),
-        held_out=(
-            held_out(nets.of_validation(file), data.validation.labels.numpy())
-            if run.cfg.evaluation.norms == TRAINED
-            else None
-        ),
-        learnt=learnt,
-        training=(
-            training_accuracy(net, data.labelled, data.owner, batch_size, device)
-            if run.cfg.data.clouds_a_class is not None
-            else None
-        ),
+        training=None
+        if cfg.data.clouds_a_class is None
+        else training_accuracy(nets, file, data.labelled),
+        data=DataHashes(**loaded.started["data"]),
+        made_of=loaded.made_of,
+        times=built.clock.taken(),
+        versions=loaded.started["versions"]
+        | ({"commit": commit} if (commit := loaded.started.get("commit")) else {}),
+    )
+
+
+def _selection(
+    run: Run, loaded: Loaded, warmup: WarmupSelection, choice: StudentSelection | None
+) -> Selection:
+    """Which weights labelled the target first and which are reported, as text."""
+    rule = f"{loaded.data.owner}_val" if warmup.rule == "source_val" else warmup.rule
+    teacher = f"{rule}, epoch {warmup.epoch}"
+    if rule == "given":
+        teacher = f"given, {loaded.started['versions']['weights'].rpartition(' ')[0]}"
+    student = choice.in_words if choice else LAST
+    return Selection(
+        teacher=teacher,
+        student=student if run.scheme.rounds else teacher,
+        validation=run.cfg.data.val,
     )
 
 
 def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
     data, classes = loaded.data, loaded.evaluation.classes
-    labels, table = data.validation.labels.numpy(), nets.of_test(file)
+    labels, table = data.validation.labels.numpy(), nets.of("test", file)
     # What adapts a net to these clouds makes it surer of them than it is right.
     before = run.folder / WARMUP_SELECTED if run.scheme.rounds else file
-    known = held_out(nets.of_validation(before, TRAINED), labels)
+    known = held_out(nets.of("validation", before, TRAINED), labels)
     counts = np.bincount(table.argmax(axis=1), minlength=len(classes))
+    right = nets.of("validation", file).argmax(axis=1) == labels
     return Quality(
-        validation_accuracy=float((nets.of_validation(file).argmax(axis=1) == labels).mean()),
-        expected=expected_accuracy(known, nets.of_test(before, norms=TRAINED)),
+        validation_accuracy=float(right.mean()),
+        expected=expected_accuracy(known, nets.of("test", before, TRAINED)),
         unlike_source=ood_share(loaded.evaluation.test, data.all_labelled),
         never_predicted=[name for name, n in zip(classes, counts, strict=True) if not n],
     )
@@ -256,15 +282,51 @@ def without_labels(
     return {name: score if math.isfinite(score) else None for name, score in scores.items()}
 
 
-def training_accuracy(
-    net: nn.Module, labelled: Labelled, owner: str, batch_size: int, device: Any
-) -> TrainingAccuracy:
-    """How many clouds the reported net was trained on, and the share that is right.
-
-    `owner`: of their labels, "source" or "target_train": whose norms the net takes for them.
-    """
-    domain = "source" if owner == "source" else "target"
-    table = predict(net, labelled.clouds.points, batch_size, device, domain=domain)
+def training_accuracy(nets: SavedNets, file: Path, labelled: Labelled) -> TrainingAccuracy:
+    """How many clouds the reported net was trained on, and the share that is right."""
+    domain = "source" if nets.data.owner == "source" else "target"
+    size = nets.run.cfg.data.eval_batch_size
+    table = predict(nets(file), labelled.clouds.points, size, nets.device, domain=domain)
     right = float((table.argmax(axis=1) == labelled.labels.numpy()).mean())
     log.info("%.1f %% of the %d training clouds are right", 100 * right, len(table))
     return TrainingAccuracy(n=len(table), accuracy=right)
+
+
+def _write(
+    run: Run, loaded: Loaded, nets: SavedNets, file: Path, learnt: Shares, predictions: Predictions
+) -> None:
+    """What is reported, with all that using it elsewhere takes, and what it predicts."""
+    cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
+    model: Any = OmegaConf.to_container(cfg.model, resolve=True)
+    if "sha256" in model:  # of a file, as of model=features: whoever loads it may stand elsewhere
+        model["file"] = str(Path(model["file"]).expanduser().absolute())
+    known = None
+    if cfg.evaluation.norms == TRAINED:
+        known = held_out(nets.of("validation", file), data.validation.labels.numpy())
+    floor = run.target.floor_m if cfg.data.scale == "above_floor" else None
+    result = Result(
+        model=model,
+        classes=evaluation.classes,
+        points=cfg.data.points,
+        stored_points=loaded.stored_points,
+        target=run.target.name,
+        gravity=run.target.gravity,
+        scale=cfg.data.scale,
+        usual=limits(data.all_labelled, data.target),
+        weights=copy_weights(nets(file)),
+        floor_m=None if floor is None else float(floor),
+        held_out=known,
+        learnt=tuple(learnt.tolist()),
+    )
+    write_result(run.folder / RESULT, result)
+    write_predictions(run.folder / PREDICTIONS, predictions)
+    if not evaluation.labelled:  # by the names of the user's files, with what is odd about each
+        rows = read_manifest(run.target.folder, evaluation.classes)
+        origins = {row.id: row.origin for row in rows if row.origin}
+        strange = ood_reasons_of_all(evaluation.test, source_limits(data.all_labelled))
+        write_predictions_of_files(
+            run.folder / OF_FILES,
+            [origins.get(id_, id_) for id_ in evaluation.test.ids],
+            ["; ".join(each) for each in strange],
+            predictions,
+        )

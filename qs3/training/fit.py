@@ -1,46 +1,64 @@
-"""The training story: load the data, build net and trainer, fit, evaluate, write.
-
-Each stage is a module of its own; what one hands to the next is a dataclass.
-"""
+"""A run is trained: load the data, build net and trainer, fit."""
 
 from __future__ import annotations
 
 import logging
 import os
 import signal
+import sys
 import time
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.exceptions import SIGTERMException
+from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
+from qs3.engine.checkpointing import AtomicCheckpointIO, Clock, SaveLast
+from qs3.engine.classifier import Classifier
+from qs3.engine.loggers import EpochRows
 from qs3.errors import ConfigError
-from qs3.methods.base import Method
+from qs3.inference.model_file import Result
+from qs3.kernels.norms import DomainNorm, check_has_norms
+from qs3.methods.base import Method, feature_dims
 from qs3.models.features import remember
 from qs3.runs.checkpoints import LAST, copy_weights, save
-from qs3.runs.metrics import RunMetrics
-from qs3.training.build import Built, build_training
-from qs3.training.evaluate import evaluate
-from qs3.training.given import read_given
-from qs3.training.load import Loaded, load_data
-from qs3.training.provenance import warn_of_changes
-from qs3.training.resume import take_checkpoint
+from qs3.selftraining.callback import SelfTraining, WarmupSelection
+from qs3.selftraining.student_selection import Student, StudentSelection
+from qs3.training.load import Loaded, load_data, read_given
+from qs3.training.provenance import changed
+from qs3.training.resume import SharedWarmup, take_checkpoint, warmup_sha256
 from qs3.training.run import STUDENT, Run
-from qs3.training.write import write_outcome
 from qs3.utils.processor import Moment, cores, keep_freed_memory, number_of, processor_seconds
 
 log = logging.getLogger(__name__)
 
+_OURS = ("threads", "gpus", "cuda_graphs", "float32_matmul")
 
-def fit(run: Run) -> RunMetrics:
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """The trainer, and the callbacks that evaluation asks afterwards."""
+
+    trainer: Trainer
+    classifier: Classifier
+    warmup: WarmupSelection
+    rounds: SelfTraining
+    student: StudentSelection
+    shared_warmup: SharedWarmup
+    clock: Clock
+
+
+def fit(run: Run) -> tuple[Loaded, Built]:
     """Train a run in its folder, from its last checkpoint on if there is one.
 
-    Returns:
-        What `metrics.json` is to hold: the same whenever the run is repeated on this machine,
-        interrupted or not, except its times.
+    The saved weights are the same whenever the run is repeated on this machine, interrupted or not.
     """
     began = Moment(time.time(), processor_seconds())
     _quieten()
@@ -54,11 +72,104 @@ def fit(run: Run) -> RunMetrics:
     if trainer.threads == "auto":  # sums are ordered by the threads that the run was begun with
         torch.set_num_threads(loaded.started["threads"])
         log.info("trainer.threads=auto: %d of %d cores", torch.get_num_threads(), len(cores()))
-    warn_of_changes(loaded.started)
-    built = build_training(run, method, loaded, given, began)
+    if found := changed(loaded.started):
+        log.warning(
+            "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
+            ", ".join(f"{name} {was}" for name, (was, _) in found.items()),
+            ", ".join(f"{name} {now}" for name, (_, now) in found.items()),
+        )
+    built = _build(run, method, loaded, given, began)
     _fit(run, loaded, built)
-    outcome = evaluate(run, loaded, built)
-    return write_outcome(run, loaded, built, outcome)
+    return loaded, built
+
+
+def _build(run: Run, method: Method, loaded: Loaded, given: Result | None, began: Moment) -> Built:
+    """Everything that `Trainer.fit` needs but the data.
+
+    `loaded`: for class names, and the hash of what the warm-up depends on; `given`: the classifier
+    to begin with; `began`: when the run started.
+    """
+    cfg, folder, phases = run.cfg, run.folder, run.phases
+    classifier = _classifier(run, method, given)
+    warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
+    rounds = SelfTraining(folder, phases, run.scheme, loaded.evaluation.classes)
+    student = StudentSelection(folder, phases, cfg.selection.student)
+    # Nobody else can use a warm-up of two versions.
+    sharing = None if changed(loaded.started) else cfg.paths.warmup_dir
+    sha256 = warmup_sha256(cfg, loaded.started)
+    shared = SharedWarmup(folder, sharing, sha256, run.seed, phases.warmup)
+    clock = Clock(began)
+    # In this order: rounds select before the student is scored, and all is done before it is saved.
+    callbacks: list[Callback] = [
+        *(warmup, rounds, student, EpochRows(folder, phases), clock),
+        *(SaveLast(folder), shared),
+    ]
+    trainer = _make_trainer(
+        cfg,
+        max_epochs=phases.total,
+        callbacks=[*_build_each(cfg.get("callbacks")), *callbacks],
+        logger=_build_each(cfg.get("logger")),
+        # In a job of SLURM Lightning would take its tasks, mostly one, for the processes.
+        plugins=[AtomicCheckpointIO(), LightningEnvironment()],
+        default_root_dir=folder,
+    )
+    domain_norms = any(isinstance(module, DomainNorm) for module in classifier.net.modules())
+    if domain_norms and isinstance(trainer.strategy, DDPStrategy):
+        # An epoch may see one of the domains alone: DDP would wait for the other's gradients, and
+        # 0 in place of none would be decayed.
+        trainer.strategy._ddp_kwargs["find_unused_parameters"] = True
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    for logger in trainer.loggers:
+        logger.log_hyperparams(settings)
+    return Built(trainer, classifier, warmup, rounds, student, shared, clock)
+
+
+def _classifier(run: Run, method: Method, given: Result | None) -> Classifier:
+    cfg, scheme = run.cfg, run.scheme
+    classifier = Classifier(
+        build_net=lambda: build(cfg.model),
+        build_optimizer=build(cfg.protocol.optimizer),
+        method=method,
+        student=Student(scheme.pcm, scheme.weight_step, scheme.mrkld, run.phases.warmup),
+        phases=run.phases,
+        seed=run.seed,
+        schedule=cfg.protocol.schedule,
+        smoothing=cfg.protocol.smoothing,
+        metres=cfg.data.scale == "metres",
+        regulariser_weight=cfg.protocol.regulariser,
+        weights=given.weights if given else None,
+        cuda_graphs=cfg.trainer.get("cuda_graphs", True) and not cfg.compile,
+    )
+    if cfg.evaluation.norms != "trained":
+        check_has_norms(classifier.net, cfg.evaluation.norms)
+    if scheme.rounds and getattr(scheme.selector, "needs_features", False):
+        feature_dims(classifier.net)  # before the warm-up, not after it
+    if cfg.compile:
+        classifier.net.compile()  # in place; nets that are only evaluated stay as they are
+    return classifier
+
+
+def _make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
+    """Lightning's trainer by config group `trainer`; `more`: arguments that follow from the run."""
+    settings: Any = OmegaConf.to_container(cfg.trainer, resolve=True)
+    given = {key: value for key, value in settings.items() if key not in _OURS}
+    if isinstance(given.get("profiler"), dict):
+        given["profiler"] = build(cfg.trainer.profiler)
+    return Trainer(
+        **given,
+        **more,
+        reload_dataloaders_every_n_epochs=1,  # each epoch has its own order; rounds, their set
+        use_distributed_sampler=False,  # `Batches` shares the clouds out itself
+        num_sanity_val_steps=0,
+        log_every_n_steps=1,
+        enable_progress_bar=sys.stderr.isatty(),
+        enable_model_summary=False,
+    )
+
+
+def _build_each(group: DictConfig | None) -> list[Any]:
+    """The objects of a config group that has several, such as `callbacks`."""
+    return [build(node) for node in (group or {}).values() if node is not None]
 
 
 def _fit(run: Run, loaded: Loaded, built: Built) -> None:

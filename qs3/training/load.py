@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
@@ -17,14 +17,14 @@ from qs3.datamodules.clouds import Clouds, labels_of, load_clouds
 from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.datamodules.splits import subsample_splits
 from qs3.datasets.domain import Domain
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
 from qs3.evaluation.prior import ESTIMATED, Prior, estimate_shares, read_prior, shares_of
+from qs3.inference.model_file import Result, read_result
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf, RoundRecord
 from qs3.store.manifest import read_manifest
 from qs3.store.store import PointSet
-from qs3.training.given import Given
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
 
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 _TIMES = 10.0  # larger: centimetres, millimetres, inches, or strays metres away from the object
 _BELOW_M = 0.3  # under all of the other domain; floors are known to a decimetre or two
 _LOOKED_AT = 1000  # clouds, for the floor: those are read from disk
-
 
 Shares = Float[np.ndarray, " c"]
 """[C], of the classes in what a net learnt from: u in `qs3.evaluation.prior`."""
@@ -64,7 +63,26 @@ class Loaded:
     learnt: Shares
 
 
-def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
+def read_given(cfg: DictConfig) -> Result | None:
+    """The trained classifier that `weights` names, which a run begins with; None without a name.
+
+    Raises:
+        MissingDataError, DataError: it is not there, or damaged.
+        ConfigError: its net or its clouds are not those of the config.
+    """
+    if cfg.weights is None:
+        return None
+    result = read_result(cfg.weights)
+    model: Any = OmegaConf.to_container(cfg.model, resolve=True)
+    for key in sorted({*model, *result.model} - ({"file"} if "sha256" in model else set())):
+        if (was := result.model.get(key)) != model.get(key):
+            raise ConfigError(f"weights={cfg.weights} has model.{key}={was}, not {model.get(key)}")
+    if result.scale != cfg.data.scale:
+        raise ConfigError(f"weights={cfg.weights} has data.scale={result.scale}")
+    return result
+
+
+def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
     """Open both domains, compare them with what the run was begun with, and load their clouds.
 
     Target labels go to the method that asks for them by name, and to the evaluation. `given`: the
@@ -92,14 +110,19 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
                 f"the classes {', '.join(classes)} and those of {target.name}, "
                 f"{', '.join(target.classes)}, must be the same num_classes={cfg.num_classes}"
             )
-    started = note_start(run, source if data.owner == "source" else target, target, given)
+    started = note_start(run, source if data.owner == "source" else target, target)
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
-    _warn_of_untrained(data, target)
-    learnt = drawn = shares_of_labelled(data, len(target.classes))
-    if given and cfg.selection.teacher == "given" and given.learnt is not None:
-        learnt = given.learnt
+    labels = data.labelled.labels.numpy()
+    counts = np.bincount(labels, minlength=len(target.classes))
+    if not counts.all():
+        names = ", ".join(np.array(target.classes)[counts == 0])
+        log.warning("no labelled cloud for training: %s", names)
+    balanced = data.labelled_domain.sampler == "balanced"
+    learnt = drawn = shares_of([] if balanced else labels, len(target.classes))
+    if given and cfg.selection.teacher == "given" and given.shares is not None:
+        learnt = given.shares
     # What is not a prior ends a run before it trains.
     prior_beside(cfg.evaluation, target.classes, learnt, lambda: learnt[None])
     if (few := cfg.data.clouds_a_split) is not None:
@@ -108,6 +131,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     if split == "train" or labels_of(target, split) is None:
         log.warning("%s has no labels for a test: only predictions are counted", target.name)
     cache, scale = data.target_domain.cache_dir, cfg.data.scale
+    rows = read_manifest(run.target.folder, target.classes)
     evaluation = Evaluation(
         load_clouds(target, split, cfg.data.points, cache_dir=cache, scale=scale),
         labels_of(target, split) if split == "test" else None,
@@ -115,19 +139,12 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         target.classes,
         cfg.evaluation.rotations,
         _objects_by_id(target, run.target),
-        _tiers_by_id(target, run.target),
+        {row.id: tier for row in rows if (tier := row.more.get("tier"))},
     )
     tested = [evaluation.test] if split == "test" else []  # else they are those for training
     check_real_sizes(run.target.name, data.all_labelled, data.target, *tested)
     made_of = DataMadeOf(source=labelled, target=of_target)
     return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt)
-
-
-def shares_of_labelled(data: AdaptationData, classes: int) -> Shares:
-    """Of the labelled clouds, as `data.sampler` draws them."""
-    if data.labelled_domain.sampler == "balanced":
-        return shares_of([], classes)
-    return shares_of(data.labelled.labels.numpy(), classes)
 
 
 def shares_of_student(scheme: SelfTrainingConfig, labelled: Shares, last: RoundRecord) -> Shares:
@@ -159,14 +176,6 @@ def prior_beside(
     return read_prior(given, classes, learnt, settings.prior_power)
 
 
-def _warn_of_untrained(data: AdaptationData, target: PointSet) -> None:
-    """Of classes that no cloud teaches: a net cannot name them."""
-    counts = np.bincount(data.labelled.labels.numpy(), minlength=len(target.classes))
-    if not counts.all():
-        names = ", ".join(np.array(target.classes)[counts == 0])
-        log.warning("no labelled cloud for training: %s", names)
-
-
 def _labels_by_id(dataset: PointSet, split: str) -> dict[str, int] | None:
     labels = labels_of(dataset, split)
     if labels is None:
@@ -183,19 +192,12 @@ def _objects_by_id(dataset: PointSet, domain: Domain) -> dict[str, str]:
     return {id_: name for id_, name in known.items() if name}
 
 
-def _tiers_by_id(dataset: PointSet, domain: Domain) -> dict[str, str]:
-    """How much of its object each cloud shows, as its importer says: "clean" or "hard"."""
-    rows = read_manifest(domain.folder, dataset.classes)
-    return {row.id: row.more["tier"] for row in rows if row.more.get("tier")}
-
-
 def check_real_sizes(target: str, source: Clouds, *parts: Clouds) -> None:
     """Compare a target's clouds with the labelled ones, if the net sees sizes.
 
     That they are in metres is the user's word (`unit`, `floor_m`). Files in millimetres would train
-    without an error, on a target of which the net then predicts one class.
-    Some that are more than ten times as large as any labelled one are named in a warning; so is a
-    floor that half of the clouds reach through.
+    without an error, on a target of which the net then predicts one class. A floor that half of the
+    clouds reach through is a warning.
 
     Args:
         target: the domain's name, for messages.
@@ -203,8 +205,8 @@ def check_real_sizes(target: str, source: Clouds, *parts: Clouds) -> None:
         parts: the target's, such as those for training and for test.
 
     Raises:
-        DataError: more than half of a part are so large, or more than half of the source's clouds
-            are so large compared with all of the target's.
+        DataError: more than half of a part are more than ten times as large as any labelled cloud,
+            or more than half of the source's clouds compared with all of the target's.
     """
     if source.scale == "unit_ball":
         return
@@ -215,24 +217,12 @@ def check_real_sizes(target: str, source: Clouds, *parts: Clouds) -> None:
         if np.mean(large) > 0.5 or np.mean(of_source > _TIMES * of_part.max()) > 0.5:
             raise DataError(
                 f"{target}: the median radius of its clouds is {np.median(of_part):.3g}, of the "
-                f"labelled ones {np.median(of_source):.3g}: one of the two is not in metres; "
-                "convert it, or set data.scale=unit_ball"
-            )
-        if large.any():
-            log.warning(
-                "%s: more than ten times as large as any labelled cloud: %s",
-                target,
-                ", ".join(part.ids[i] for i in np.flatnonzero(large)[:3]),
+                f"labelled ones {np.median(of_source):.3g}: one of the two is not in metres"
             )
         if source.scale == "above_floor":
             lowest = _lowest(part)
             if np.mean(lowest < _lowest(source).min() - _BELOW_M) > 0.5:
-                log.warning(
-                    "%s: half of the clouds end %.2g m or more below their floor (floor_m=%g)",
-                    target,
-                    -np.median(lowest),
-                    part.floor,
-                )
+                log.warning("%s: half of the clouds reach below floor_m=%g", target, part.floor)
 
 
 def _lowest(clouds: Clouds) -> np.ndarray:

@@ -17,10 +17,10 @@ import os
 import platform
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.utils import get_object
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config import hashing
 from qs3.errors import MissingDataError
@@ -28,27 +28,20 @@ from qs3.runs import folder as runs
 from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.store.store import PointSet, is_finished
 from qs3.training.run import Run, run_of
-from qs3.utils.files import remove_leftovers
+from qs3.utils.files import remove_leftovers, sha256_file
 from qs3.utils.version import VERSION, commit
-
-if TYPE_CHECKING:
-    from qs3.training.given import Given
 
 log = logging.getLogger(__name__)
 
-WEIGHTS = "the classifier that weights= names"
 
-
-def note_start(
-    run: Run, source: PointSet, target: PointSet, given: Given | None = None
-) -> dict[str, Any]:
+def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
     """Read `started.json` and compare it with today's data, or write it; `force` begins anew."""
     import torch
 
     from qs3.datamodules.fps_samples import remove_old_leftovers
     from qs3.runs.checkpoints import LAST
 
-    weights = {"weights": f"{given.name} {given.sha256}"} if given else {}
+    weights = {"weights": _weights(run.cfg)} if run.cfg.weights is not None else {}
     now: dict[str, Any] = {
         "data": {"source": source.sha256, "target": target.sha256},
         "versions": versions() | weights,
@@ -85,12 +78,21 @@ def compare(folder: Path, started: Mapping[str, Any], now: Mapping[str, Any]) ->
     runs.check_config(folder, started.get("config_sha256"), now["config_sha256"])
     for role in ("source", "target"):
         runs.check_data(folder, f"data.{role}", started["data"][role], now["data"][role])
-    runs.check_data(folder, WEIGHTS, given_sha256(started), given_sha256(now))
+    was, is_now = (_sha256_of(one["versions"]) for one in (started, now))
+    runs.check_data(folder, "the classifier that weights= names", was, is_now)
 
 
-def given_sha256(started: Mapping[str, Any]) -> str:
-    """Of the classifier that a run was begun with; "" without one."""
-    return started["versions"].get("weights", "").rpartition(" ")[2]
+def _weights(cfg: DictConfig) -> str:
+    """Name and SHA-256 of the classifier that a run begins with."""
+    from qs3.inference.model_file import read_result
+    from qs3.runs.checkpoints import weights_sha256
+
+    return f"{Path(cfg.weights).name} {weights_sha256(read_result(cfg.weights).weights)}"
+
+
+def _sha256_of(versions: Mapping[str, str]) -> str:
+    """Of the classifier; "" without one."""
+    return versions.get("weights", "").rpartition(" ")[2]
 
 
 def versions() -> dict[str, str]:
@@ -119,16 +121,6 @@ def changed(started: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
         begun[name], now[name] = started["files"][name][:12], sha256[:12]
     names = [name for name in {**begun, **now} if begun.get(name) != now.get(name)]
     return {name: (begun.get(name), now.get(name)) for name in names}
-
-
-def warn_of_changes(started: Mapping[str, Any]) -> None:
-    """Warn if a run goes on with other code, versions or threads than it was begun with."""
-    if found := changed(started):
-        log.warning(
-            "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
-            ", ".join(f"{name} {was}" for name, (was, _) in found.items()),
-            ", ".join(f"{name} {now}" for name, (_, now) in found.items()),
-        )
 
 
 PACKAGES = (
@@ -173,13 +165,10 @@ def refuse_changed(run: Run, metrics: RunMetrics, instead: str = runs.ANEW) -> N
             was, now = getattr(metrics.data, role), domain.open(verify=False).sha256
             runs.check_data(run.folder, domain.name, was, now, instead)
     if run.cfg.weights is not None:
-        from qs3.training.given import read_given
-
-        name, _, sha256 = metrics.versions.get("weights", "").rpartition(" ")
         with contextlib.suppress(MissingDataError):
-            given = read_given(run.cfg)
-            assert given is not None
-            runs.check_data(run.folder, f"the classifier {name}", sha256, given.sha256, instead)
+            name, _, sha256 = _weights(run.cfg).rpartition(" ")
+            was = _sha256_of(metrics.versions)
+            runs.check_data(run.folder, f"the classifier {name}", was, sha256, instead)
 
 
 def files_sha256(cfg: DictConfig) -> dict[str, str]:
@@ -205,22 +194,24 @@ def changed_files(known: Mapping[str, str]) -> dict[str, str]:
 def _sha256(own: Path | None) -> str:
     """64 hex digits over the Python files of a folder; None: of `PACKAGES`."""
     root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
-    folders = [root / name for name in PACKAGES]
-    for folder in folders if own is None else [own]:
-        for file in sorted(folder.glob("*.py") if own else folder.rglob("*.py")):
-            sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
-            digest.update(f"{file.name} {sha256}\n".encode())
+    files = sorted(own.glob("*.py")) if own else []
+    for name in () if own else PACKAGES:
+        files += sorted((root / name).rglob("*.py"))
+    for file in files:
+        digest.update(f"{file.name} {sha256_file(file)}\n".encode())
     return digest.hexdigest()
 
 
 def _targets(node: Any) -> Iterator[str]:
     """All `_target_` of a part of a config that are the user's own."""
-    plain = OmegaConf.to_container(node, resolve=False) if OmegaConf.is_config(node) else node
-    if isinstance(plain, dict):
-        if (target := str(plain.get("_target_", "qs3."))) and not target.startswith(_VERSIONED):
+    if isinstance(node, DictConfig | ListConfig):
+        node = OmegaConf.to_container(node, resolve=False)
+    if isinstance(node, dict):
+        target = str(node.get("_target_", "qs3."))
+        if not target.startswith(_VERSIONED):
             yield target
-        plain = list(plain.values())
-    for value in plain if isinstance(plain, list) else ():
+        node = list(node.values())
+    for value in node if isinstance(node, list) else ():
         yield from _targets(value)
 
 

@@ -1,26 +1,52 @@
-"""`ckpt_path`: where a run goes on. By itself it goes on from its own last checkpoint, if any."""
+"""Where a run goes on: its own last checkpoint, one from elsewhere, or another run's warm-up.
+
+`ckpt_path` brings the same run from another place. Warm-ups are trained once: runs that differ only
+in what follows go on from one checkpoint. When a run is one epoch away from the end of its warm-up,
+its checkpoint is copied to
+
+    <paths.warmup_dir>/<hash>-seed<seed>/last.ckpt, history.csv, started.json
+
+The hash covers everything that the warm-up depends on, datasets, versions and code included. A run
+of the same hash begins from that copy as if it had been interrupted there: it trains the last
+epoch itself, so teacher, pseudo-labels and result are the same, to the bit, as without it.
+`started.json` is written last and has the hashes of the other two: a copy that has changed since is
+replaced. Who copies holds a lock there, which ends with its process: of runs that started together
+the first gives its warm-up, and who comes meanwhile waits for whole files.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import MissingDataError
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
+from omegaconf import DictConfig, OmegaConf
+
+from qs3.config import hashing
+from qs3.engine.loggers import HISTORY
+from qs3.errors import DataError, MissingDataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST, check
 from qs3.runs.metrics import METRICS
 from qs3.training.provenance import compare
 from qs3.training.run import Run
-from qs3.utils.files import copy_file
-from qs3.utils.locks import check_idle
+from qs3.utils.files import copy_file, remove_leftovers, sha256_file, write_json
+from qs3.utils.locks import check_idle, locked
 
 log = logging.getLogger(__name__)
 
 _OF_BEGINNING = ("versions", "threads", "commit", "files")  # of what was trained there
 _STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, METRICS)
+_FILES = (HISTORY, LAST)
+# Not `selection`: the checkpoint holds the teacher chosen so far.
+_AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_name")
 
 
 def checkpoint_asked_for(run: Run) -> Path | None:
@@ -44,10 +70,8 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
     """Do what `ckpt_path` asks for, before training begins.
 
     null does nothing. "last" insists on a checkpoint of the run. A path, of a run's folder or of
-    the `last.ckpt` in it, brings the same run from elsewhere: another machine's logs, a backup. As
-    settings, seed and data must be the same, the result is that of a run that was never moved;
-    other versions of torch, or another number of threads, may change it, which is a warning. A run
-    that has a checkpoint of its own goes on from that.
+    the `last.ckpt` in it, brings the same run from elsewhere: another machine's logs, a backup. A
+    run that has a checkpoint of its own goes on from that.
 
     Args:
         run: whose folder it is.
@@ -88,3 +112,91 @@ def bring(other: Path, folder: Path) -> None:
         if part.parts[0] not in _STAYS and file.suffix != ".log" and part.name != LAST:
             copy_file(file, folder / part)
     copy_file(other / LAST, folder / LAST)
+
+
+def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
+    """64 hex digits over what a warm-up depends on (also `started.json`), except its seed."""
+    before = OmegaConf.create(hashing.with_values(cfg, _AFTERWARDS))
+    for key in _AFTERWARDS:
+        OmegaConf.update(before, key, None)
+    parts = [hashing.config_sha256(before), started["data"], started["versions"]]
+    parts += [started["threads"], started["files"]]  # sums are ordered by threads
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+class SharedWarmup(Checkpoint):
+    """Gives a run's warm-up to others, and takes theirs; behind `SaveLast` among the callbacks.
+
+    Args:
+        folder: of the run.
+        shared: `paths.warmup_dir`; None shares nothing.
+        sha256: of the warm-up.
+        seed: of the run.
+        warmup: epochs of the warm-up; of a single one nothing is worth sharing.
+    """
+
+    def __init__(
+        self, folder: Path, shared: str | Path | None, sha256: str, seed: int, warmup: int
+    ) -> None:
+        self.folder, self.sha256, self.last_but_one = folder, sha256, warmup - 2
+        self.shared = None if shared is None else Path(shared) / f"{sha256[:8]}-seed{seed}"
+
+    def take(self) -> bool:
+        """Begin from a shared warm-up, if there is one and the run has no checkpoint yet."""
+        if self.shared is None or not self.shared.is_dir() or (self.folder / LAST).exists():
+            return False
+        with self._alone():
+            if not self._is_there():
+                if (self.shared / runs.STARTED).exists():
+                    log.warning("the warm-up in %s is damaged: it is trained again", self.shared)
+                return False
+            log.info("the warm-up was trained before: going on from %s", self.shared)
+            for name in _FILES:  # the checkpoint last: with it a run counts as begun
+                copy_file(self.shared / name, self.folder / name)
+        return True
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Copy the checkpoint that has just been written, one epoch before the warm-up's end."""
+        if trainer.current_epoch != self.last_but_one or not trainer.is_global_zero:
+            return
+        try:
+            if self.shared is not None:
+                with self._alone():
+                    self._give()
+        except Exception as error:  # a full disk, say: sharing is a convenience
+            log.warning("the warm-up cannot be shared (%s); training goes on", error)
+
+    def _give(self) -> None:
+        """Copy the run's files, unless a complete warm-up is there; a kill leaves no mark."""
+        assert self.shared is not None
+        if self._is_there():
+            return
+        (self.shared / runs.STARTED).unlink(missing_ok=True)
+        remove_leftovers(self.shared)  # of a copy that was killed
+        for name in _FILES:
+            copy_file(self.folder / name, self.shared / name)
+        write_json(self.shared / runs.STARTED, _mark(self.sha256, self.folder))
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Wait until nobody copies there, as far as there can be a lock: it needs a file."""
+        assert self.shared is not None
+        with contextlib.ExitStack() as stack:
+            if not self.shared.exists() or os.access(self.shared, os.W_OK):
+                stack.enter_context(locked(self.shared / ".lock"))
+            yield
+
+    def _is_there(self) -> bool:
+        """Whether a complete one of this hash lies there, as it was written."""
+        assert self.shared is not None
+        try:
+            mark = runs.read_started(self.shared)
+            return mark == _mark(self.sha256, self.shared) if mark else False
+        except (DataError, OSError):  # damaged: as good as not there
+            return False
+
+
+def _mark(sha256: str, folder: Path) -> dict[str, Any]:
+    """What says that the files in a folder are the warm-up of this hash."""
+    files = {name: sha256_file(folder / name) for name in _FILES}
+    return {"warmup_sha256": sha256, "files": files}

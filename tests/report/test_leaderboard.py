@@ -63,7 +63,7 @@ TOY = shlex.join(
     [
         *("num_classes=3", "model._target_=tests.training.nets.tiny", "data.points=32"),
         *("protocol.epochs=1", "protocol.steps=null", "protocol.optimizer.lr=0.02"),
-        *("callbacks.progress=null", "report.pictures=false"),
+        "report.pictures=false",
     ]
 )
 SMALL = """

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import csv
-import math
 
 import pytest
 import torch
-from torch import nn
 from torch.nn import functional as F
 
 from qs3.config import hashing
 from qs3.datamodules.phases import Phases
-from qs3.engine.classifier import Classifier, Plateau
+from qs3.engine.classifier import Classifier
 from qs3.methods.base import class_loss
 from qs3.methods.bounds import SourceOnly
 from qs3.models.pointnet import pointnet, transform_regulariser
@@ -30,23 +28,6 @@ def test_smoothing_spreads_over_the_other_classes():
     torch.testing.assert_close(class_loss(logits, labels, 0.2), by_hand)
     torch.testing.assert_close(class_loss(logits, F.one_hot(labels, 4).double(), 0.2), by_hand)
     torch.testing.assert_close(class_loss(logits, labels), F.cross_entropy(logits, labels))
-
-
-def test_plateau_halves_after_eleven_epochs_without_a_lower_loss():
-    optimizer = torch.optim.Adam([nn.Parameter(torch.zeros(1))], lr=1e-3)
-    plateau, rates = Plateau(optimizer), []
-    for loss in [2.0, 1.0, *[1.0] * 11, 0.5, *[0.6] * 11]:
-        plateau.step(loss)
-        rates.append(optimizer.param_groups[0]["lr"])
-    assert rates[:12] == [1e-3] * 12
-    assert rates[12:24] == [5e-4] * 12
-    assert rates[24] == 2.5e-4
-    for _ in range(200):
-        plateau.step(0.6)
-    assert optimizer.param_groups[0]["lr"] == 1e-5
-    plateau.start_phase()
-    assert optimizer.param_groups[0]["lr"] == 1e-3
-    assert plateau.state_dict()["best"] == math.inf
 
 
 SIMPLEVIEW = ("protocol=simpleview", "protocol.epochs=40", "protocol.optimizer.lr=4.0")

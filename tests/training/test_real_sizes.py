@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -37,22 +36,12 @@ def test_a_target_in_millimetres_is_refused():
         check_real_sizes("own", boxes(300, 500, 500, 2000), boxes(0.4, 0.6))
 
 
-def test_some_clouds_in_other_units_are_named(caplog: pytest.LogCaptureFixture):
-    check_real_sizes("own", boxes(*FURNITURE), boxes(0.5, 500, 0.5, 0.4, 1.9, 18))
-    (warning,) = caplog.messages
-    assert warning.startswith("own")
-    assert warning.endswith(": scan1")
-
-
-@pytest.mark.parametrize(
-    ("lowest", "said"), [(-1.2, ["own: half of the clouds end 1.2 m or more below"]), (-0.2, [])]
-)
-def test_a_floor_that_clouds_reach_through(lowest, said, caplog: pytest.LogCaptureFixture):
-    caplog.set_level(logging.WARNING)
+@pytest.mark.parametrize(("lowest", "warns"), [(-1.2, True), (-0.2, False)])
+def test_a_floor_that_clouds_reach_through(lowest, warns, caplog: pytest.LogCaptureFixture):
     source = boxes(*FURNITURE, scale="above_floor")
     scans = boxes(0.4, 0.6, scale="above_floor", lowest=lowest)
     check_real_sizes("own", source, scans)
-    assert [message[: len(said[0])] for message in caplog.messages] == said
+    assert bool(caplog.messages) == warns
 
 
 def test_a_training_finds_it_before_it_trains(toy, toy_data: Path, tmp_path: Path):

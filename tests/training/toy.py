@@ -95,7 +95,6 @@ def overrides(root: Path, *more: str) -> list[str]:
         "protocol.optimizer.lr=0.02",
         *(f"selftraining.{x}" for x in rounds if "selftraining=none" not in more),
         "trainer.threads=1",
-        "callbacks.progress=null",
         "logger=csv",
         "report.pictures=false",
         *more,
