@@ -41,26 +41,19 @@ MODELNET40: tuple[str, ...] = (
 
 def class_list(classes: str | Sequence[str] | None) -> tuple[str, ...]:
     """What a config says: names, "modelnet40", or nothing (the ten)."""
-    if classes is None:
-        return CLASSES
     if isinstance(classes, str):
         return MODELNET40 if classes == "modelnet40" else (classes,)
-    return tuple(str(name) for name in classes)
+    return CLASSES if classes is None else tuple(map(str, classes))
 
 
 def known_as(name: str, classes: Sequence[str]) -> str | None:
-    """Which of `classes` a folder or file calls `name`, whatever its case; None if none.
+    """Which of `classes` a folder or file calls `name`, whatever its case; None if none."""
 
-    A name of the list itself comes first: `night_stand` is a class of ModelNet40, and an alias of
-    `cabinet` among the ten.
-    """
-    if name in classes:
+    def plain(word: str) -> str:
+        whole = unicodedata.normalize("NFC", word)  # macOS writes an umlaut as two characters
+        return whole.casefold().replace("-", "_").replace(" ", "_")
+
+    if name in classes:  # before aliases: `night_stand` is a class of ModelNet40
         return name
-    plain = _plain(name)
-    names = {_plain(known): known for known in classes}
-    return next((names[c] for c in (plain, ALIASES.get(plain)) if c in names), None)
-
-
-def _plain(name: str) -> str:
-    whole = unicodedata.normalize("NFC", name)  # macOS writes an umlaut as two characters
-    return whole.casefold().replace("-", "_").replace(" ", "_")
+    names = {plain(known): known for known in classes}
+    return next((names[c] for c in (plain(name), ALIASES.get(plain(name))) if c in names), None)

@@ -1,8 +1,4 @@
-"""Errors that are meant for the person at the keyboard.
-
-Every one says what is wrong, where (file, key, item), and what to do. The command line
-prints their message without a traceback; anything else is a defect of ours and keeps it.
-"""
+"""Errors that are meant for the user: the command line prints them without a traceback."""
 
 
 class Qs3Error(Exception):
@@ -34,7 +30,7 @@ class RenderError(Qs3Error):
 
 
 class ClusterError(Qs3Error):
-    """The machines that were to work for this one cannot go on."""
+    """Other machines that work for this one cannot go on."""
 
 
 class SelectionError(Qs3Error):

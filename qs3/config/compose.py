@@ -38,16 +38,13 @@ def composing() -> Iterator[Callable[..., Any]]:
 
 
 def composed(command: str | None, *overrides: str, place: str = "", **more: Any) -> DictConfig:
-    """The config that a command would run with.
+    """The config that a command would run with; ConfigError for a wrong word.
 
     Args:
         command: "train" or "generate"; None composes the overrides alone (`+sensor=NAME`).
         overrides: words of its command line.
         place: begins the message of an error: "domain=modelnet10: ".
         more: for `hydra.compose`.
-
-    Raises:
-        ConfigError: no such group, choice or key.
     """
     from hydra.errors import HydraException
 

@@ -50,9 +50,9 @@ def config_sha256(cfg: DictConfig) -> str:
     """64 hex digits over the composed config, without the keys that do not change a result.
 
     Interpolations are hashed as they are written: what they point to is hashed at its own place,
-    or does not matter (`${paths.data_dir}/...`). But a method's or a model's file is hashed by its
-    content, and by its value what comes from outside of the config (`${oc.env:NAME}`), or from a
-    `selftraining` without rounds, which is not hashed itself.
+    or does not matter. But by its value is hashed what comes from outside of the config
+    (`${oc.env:NAME}`), or from a `selftraining` without rounds, which is not hashed itself; and a
+    method's or a model's file by its content.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
     for group in ("method", "model"):
@@ -74,10 +74,7 @@ def config_sha256(cfg: DictConfig) -> str:
 
 
 def with_values(cfg: DictConfig, keys: Sequence[str]) -> Any:
-    """The config as nested dicts, with values in place of interpolations of these keys.
-
-    It can then be hashed without them: all else is as it is written.
-    """
+    """The config as nested dicts, with values in place of interpolations of these keys."""
     return _with_values(OmegaConf.to_container(cfg, resolve=False), cfg, "", _from(keys))
 
 

@@ -7,8 +7,6 @@ Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_i
 
 from __future__ import annotations
 
-import functools
-import inspect
 import itertools
 import re
 import textwrap
@@ -19,7 +17,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, InstantiationException
 from hydra.types import RunMode
-from hydra.utils import get_object, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import ValidationError
 
@@ -30,21 +28,19 @@ from qs3.utils.settings import problems
 
 
 def _tags(*, _root_: DictConfig) -> ListConfig:
-    """For loggers: method, self-training, net and domains, and whether the target is simulated.
-
-    A node of the config: OmegaConf cannot put a plain list in its place (`--cfg job --resolve`).
-    """
+    """For loggers: method, self-training, net and domains, and whether the target is simulated."""
     names, data = component_names(_root_), _root_.data
     tags = [f"{data.source.name} -> {data.target.name}", *dict.fromkeys(names.values())]
     simulated = ["simulated"] if data.target.get("simulated") else []
+    # A node of the config: `--cfg job --resolve` cannot put a plain list in its place.
     return ListConfig([tag for tag in tags if tag != "none"] + simulated)
 
 
 def _gpu_in_turn(gpus: int | None = None) -> int:
     """The GPU for this job: its number in the sweep, modulo `gpus`; 0 outside of a sweep.
 
-    A variable such as CUDA_VISIBLE_DEVICES would come too late in a process that has run a job
-    before. `gpus` is how many there are; None: as many as CUDA finds.
+    `gpus` is how many there are; None: as many as CUDA finds. (CUDA_VISIBLE_DEVICES would come too
+    late in a process that has run a job before.)
     """
     if not in_multirun():
         return 0
@@ -78,10 +74,7 @@ def _sha256(file: str | None) -> str:
 
 
 def _choices(group: str, indent: int = 0) -> str:
-    """The choices of a config group, as `a | b`, without `none`.
-
-    With `indent`, in lines of 100 characters that all begin in that column.
-    """
+    """The choices of a config group, as `a | b`; with `indent` in lines that begin there."""
     text = " | ".join(path.stem for path in _files(group))
     return ("\n" + " " * indent).join(textwrap.wrap(text, 100 - indent)) if indent else text
 
@@ -91,9 +84,8 @@ def _described(group: str, also: str = "") -> str:
 
     With `also` only the choices that another group has, too.
     """
-    files = _files(group)
-    if also:
-        files = [path for path in files if path.name in {other.name for other in _files(also)}]
+    both = {path.name for path in _files(also or group)}
+    files = [path for path in _files(group) if path.name in both]
     width = max((len(path.stem) for path in files), default=0)
     lines = []
     for path in files:
@@ -129,11 +121,8 @@ OmegaConf.register_new_resolver("qs3.sha256", _sha256, replace=True, use_cache=T
 def build(node: Any, **more: Any) -> Any:
     """`instantiate` with plain containers, and with our own errors as they were raised.
 
-    Raises:
-        ConfigError: the target does not take what stands in the config (a TypeError or ValueError
-            of its own), or a switch is neither true nor false; names the place in the config.
+    A TypeError or ValueError of the target becomes a ConfigError that names the place.
     """
-    _check_switches(node)
     try:
         return instantiate(node, _convert_="all", **more)
     except InstantiationException as error:
@@ -149,34 +138,6 @@ def build(node: Any, **more: Any) -> Any:
                 raise ConfigError(problems(error.__cause__, where)) from None
             raise ConfigError(f"{where}: {error.__cause__}") from error
         raise
-
-
-def _check_switches(node: Any) -> None:
-    """Raise ConfigError for a text where a target takes a bool: `no` is one to Hydra, and true.
-
-    Goes down as far as `instantiate` does.
-    """
-    if isinstance(node, ListConfig):
-        for item in node:
-            _check_switches(item)
-    if not isinstance(node, DictConfig) or node._is_none() or node._is_missing():
-        return
-    taken = _bools(str(node["_target_"])) if "_target_" in node else frozenset()
-    for key in node:
-        value = None if OmegaConf.is_missing(node, key) else node[key]
-        if key in taken and isinstance(value, str):
-            raise ConfigError(f"{node._get_full_key(key)} must be true or false, got {value!r}")
-        if node.get("_recursive_", True):
-            _check_switches(value)
-
-
-@functools.cache
-def _bools(target: str) -> frozenset[str]:
-    """The parameters of a class or function of ours that are annotated as bool."""
-    if not target.startswith("qs3."):
-        return frozenset()
-    taken = inspect.signature(get_object(target)).parameters.items()
-    return frozenset(key for key, one in taken if one.annotation in ("bool", bool))
 
 
 def cli_errors(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:

@@ -52,6 +52,7 @@ ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
 INPUT, OUTPUT = "points", "logits"
 _CHECKED = 32  # clouds to compare on
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
+_PRIVATE = ("paths.", "hydra.")  # overrides that no other machine needs
 _FEATURES = "qs3.models.features.features"  # a head on a file that has no place in a folder
 
 
@@ -173,12 +174,10 @@ def card(result: Result, metrics: RunMetrics | None, command: str = "") -> str:
 def _command(run: Path) -> str:
     """That trained the run, if it is known; of absolute paths only the last part."""
     path = run / ".hydra" / "overrides.yaml"
-    try:
-        words = [str(word) for word in yaml.safe_load(path.read_text()) or []]
-    except OSError:
+    if not path.is_file():
         return ""
-    kept = [word for word in words if not word.startswith(("paths.", "hydra."))]
-    return shlex.join(["qs3-train", *(re.sub(r"=[/~].*/", "=", word) for word in kept)])
+    words = [word for word in yaml.safe_load(path.read_text()) if not word.startswith(_PRIVATE)]
+    return shlex.join(["qs3-train", *(re.sub(r"=[/~].*/", "=", word) for word in words)])
 
 
 def export(
@@ -322,11 +321,7 @@ def _quiet() -> Iterator[None]:
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
-        with warnings.catch_warnings():
-            # A warning about tensors that share memory; the logits are compared after reading back.
-            warnings.filterwarnings("ignore", message="No complete tensor found")
-            # torch 2.13 asks its own tree of arguments in an old way, when it copies it.
-            warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)
+        with warnings.catch_warnings(action="ignore"):  # the logits are compared
             yield
     finally:
         logging.disable(before)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -99,9 +99,8 @@ class Sample:
     def upright(self) -> Float[np.ndarray, "n 3"]:
         """The cloud with z up, whatever frame a net sees it in."""
         cloud = np.empty((0, 3)) if self.cloud is None else np.asarray(self.cloud, np.float64)
-        if self.world_from_camera is not None:
-            return cloud @ np.asarray(self.world_from_camera).T
-        return turned(cloud[:, :3], self.axis)
+        turn = self.world_from_camera
+        return turned(cloud, self.axis) if turn is None else cloud @ turn.T
 
     def failed(self, error: Qs3Error | str, file: str = "") -> Sample:
         """The same, with the reason; the file's name before it has a column of its own."""
@@ -202,18 +201,13 @@ def _archive(archive: Archive, part: str, classes: Sequence[str]) -> Inputs:
 
 def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sample]:
     cloud = archive.cloud(index, inliers_only=True)
-    extent = np.ptp(cloud, axis=0).astype(float)
-    piece = Piece(
-        cloud,
-        np.ones(len(cloud), dtype=bool),
-        len(cloud) if archive.pixels is None else int(archive.pixels[index]),
-        holes=0.0,
-        rim=0.0 if archive.rim is None else float(archive.rim[index]),
-        occ=0.0 if archive.occ is None else float(archive.occ[index]),
-        extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
-    )
     tier, cautions = str(archive.tier[index]), []
     if tier == "hard":
+        known = (archive.pixels, archive.rim, archive.occ)
+        pixels, rim, occ = (0.0 if one is None else float(one[index]) for one in known)
+        extent: Any = tuple(np.ptp(cloud, axis=0).tolist())
+        inlier, seen = np.ones(len(cloud), dtype=bool), int(pixels) or len(cloud)
+        piece = Piece(cloud, inlier, seen, holes=0.0, rim=rim, occ=occ, extent_m=extent)
         cautions = [Caution(one.kind, one.words) for one in faults(piece, "", RULES)]
         cautions = cautions or [Caution("otherwise hard", "the archive calls it hard")]
     yield Sample(
@@ -242,8 +236,7 @@ def depth_images(
         depth: a file or a folder.
         mask: likewise; those of a folder have the names of their depth images. Or:
         box: left, top, right, bottom in pixels.
-        intrinsics: "fx,fy,cx,cy", or a file.
-        scale_m: metres a unit; None: see `qs3.datasets.depth_images`.
+        intrinsics, scale_m: see `qs3.datasets.depth_images`.
         up: "x,y,z" in camera coordinates, "-y" for a level camera; "": not known.
         gravity: of the net; "none": clouds stay in the camera's frame.
     """

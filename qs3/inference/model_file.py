@@ -34,7 +34,7 @@ from torch import Tensor, nn
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.expected import HeldOut
 from qs3.runs.checkpoints import load, save
-from qs3.utils.files import atomic_path, make_folder, sha256_file, write_json, write_text
+from qs3.utils.files import atomic_path, make_folder, reading, sha256_file, write_json, write_text
 from qs3.utils.settings import problems
 from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
@@ -113,6 +113,9 @@ class Result:
         return "" if f"{module}.".startswith(f"{PACKAGES[0]}.") else module
 
 
+_RESULT = TypeAdapter(Result)
+
+
 def pretrained_names() -> list[str]:
     """Names of the classifiers that come with qs3."""
     return sorted(path.parent.name for path in PRETRAINED.glob(f"*/{CONFIG}"))
@@ -126,7 +129,7 @@ def pretrained_name(file: Path) -> str | None:
 
 def write_result(path: Path, result: Result) -> None:
     """Save it, atomically."""
-    save({"qs3": VERSION, **_values(result)}, path)
+    save({"qs3": VERSION, **_RESULT.dump_python(result)}, path)
 
 
 def write_folder(folder: Path, result: Result, card: str) -> None:
@@ -138,11 +141,8 @@ def write_folder(folder: Path, result: Result, card: str) -> None:
         safetensors.torch.save_file(weights, path, {"format": "pt"})
     write_text(folder / CARD, card)
     about = {"library_name": "qs3", "qs3": VERSION, _HASH: sha256_file(folder / WEIGHTS)}
-    plain = {name: value for name, value in _values(result).items() if name != "weights"}
-    plain["usual"] = {  # JSON has no infinity: an open end is null
-        name: [None if math.isinf(end) else end for end in ends]
-        for name, ends in result.usual.items()
-    }
+    # JSON has no infinity: an open end in `usual` is null.
+    plain = json.loads(_RESULT.dump_json(result, exclude={"weights"}))
     write_json(folder / CONFIG, about | plain)
 
 
@@ -168,18 +168,16 @@ def read_result(path: str | Path) -> Result:
     if file.name != WEIGHTS:
         return _checked(file, load(file, advice="copy it again, or repeat its run"))
     config = file.with_name(CONFIG)
-    try:
+    with reading(config):
         values, data = json.loads(config.read_bytes()), file.read_bytes()
-        if hashlib.sha256(data).hexdigest() != values.pop(_HASH):
-            raise ValueError(f"the SHA-256 of {WEIGHTS} is not {_HASH}")
+        known = values.pop(_HASH)
+        assert hashlib.sha256(data).hexdigest() == known, f"the SHA-256 of {WEIGHTS} is not {_HASH}"
         values["weights"] = safetensors.torch.load(data)
         values["usual"] = {
             name: [-math.inf if low is None else low, math.inf if high is None else high]
             for name, (low, high) in values["usual"].items()
         }
         del values["library_name"]
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DataError(f"{config} or {WEIGHTS} is damaged, or of another: {error}") from error
     return _checked(config, values)
 
 
@@ -197,9 +195,7 @@ def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
         net.load_state_dict(result.weights)
     except (TypeError, ValueError, RuntimeError, AttributeError, ConfigError) as error:
         first = " ".join(str(error).split()[:40])
-        raise DataError(
-            f"the file's {target} cannot be built, or has other weights: {first}"
-        ) from (error)
+        raise DataError(f"the file's {target} cannot be built from it: {first}") from error
     return net.eval()
 
 
@@ -221,18 +217,10 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
     return make
 
 
-def _values(result: Result) -> dict[str, Any]:
-    """By name, as tensors and plain values."""
-    values = {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
-    held_out = dataclasses.asdict(result.held_out) if result.held_out else None
-    return {**values, "classes": list(result.classes), "held_out": held_out}
-
-
 def _checked(file: Path, found: Any) -> Result:
-    """The file's values as a `Result`; DataError names what is wrong."""
-    try:
-        values = {name: value for name, value in found.items() if name != "qs3"}
-        return TypeAdapter(Result).validate_python(values)
-    except (ValidationError, AttributeError) as error:
-        why = problems(error) if isinstance(error, ValidationError) else error
-        raise DataError(f"{file} is not a classifier that qs3 wrote, or damaged: {why}") from error
+    """The file's values as a `Result`."""
+    with reading(file):
+        try:
+            return _RESULT.validate_python({k: found[k] for k in found if k != "qs3"})
+        except ValidationError as error:
+            raise ValueError(problems(error)) from error

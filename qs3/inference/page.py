@@ -82,18 +82,15 @@ def page(
         cards = [_card(one, classes, floor_m) for one in shown if right(one, classes) is wanted]
         total = sum(right(one, classes) is wanted for one in predicted)
         groups += [(heading, total, note, cards)] * bool(cards)
-    surety = ""
-    if found:
-        points = round(100 * (found.confidence - found.all.share))
-        surety = f"{abs(points)} points too {'sure' if points > 0 else 'unsure'}"
-        surety = "about as sure as it is right" if abs(points) < 5 else surety
+    points = round(100 * (found.confidence - found.all.share)) if found else 0
+    surety = f"{abs(points)} points too {'sure' if points > 0 else 'unsure'}"
     return render(
         "predictions.html",
         title=title,
         found=found,
         predicted=len(predicted),
         labelled=any(one.label for one in predicted),
-        surety=surety,
+        surety=surety if abs(points) >= 5 else "about as sure as it is right",
         collapsed=_collapsed(predicted),
         groups=groups,
         failed=[(one.name, one.reason) for one in samples if not one.cls],
@@ -144,10 +141,7 @@ def _card(one: Sample, classes: Sequence[str], floor_m: float | None) -> dict[st
 
 
 def _size(cloud: Float[np.ndarray, "n 3"], floor_m: float | None) -> str:
-    """How large it is: a chair's back and a monitor look alike when both fill their card.
-
-    And how high it begins where the floor is known: nets that know heights depend on it, too.
-    """
+    """How large it is (in its card a chair's back and a monitor look alike), and how high."""
     angles = np.linspace(0, np.pi, 18, endpoint=False)
     across = cloud[:, :2] @ np.stack([np.cos(angles), np.sin(angles)])  # [n, 18]
     size = f"{np.ptp(across, axis=0).max():.2f} m wide, {np.ptp(cloud[:, 2]):.2f} m high"

@@ -178,8 +178,8 @@ def _agreement(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
     parts = []
     for words, differs in (("agrees on", False), ("differs on", True)):
         some = [one for one in asked if disputed(one) is differs]
-        judged = [r for one in some if (r := right(one, classes)) is not None]
-        share = f" ({sum(judged) / len(judged):.0%} right)" if judged else ""
+        judged = [right(one, classes) for one in some if one.label in classes]
+        share = f" ({np.mean(judged):.0%} right)" if judged else ""
         parts.append(f"{words} {len(some)}{share}")
     line = f"a second classifier {', '.join(parts)} (column second); inspect disagreements"
     return [line] if asked else []

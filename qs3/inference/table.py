@@ -68,28 +68,16 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores of the samples with a prediction and a label that is one of the net's classes.
-
-    Attributes:
-        all: right ones.
-        balanced: mean over the classes that are there of the share that is right, in [0, 1].
-        majority: the commonest label, and how many have it.
-        confidence: mean over all of them, in [0, 1].
-        tiers: right ones of each tier, if there are any.
-        kinds: by what was wrong with a cloud: right ones with it, and without it.
-        confusion: [C, C] how often each label (row) was called each class (column).
-        unknown: labels that are not among the net's classes, and how often.
-        unlabelled: samples with a prediction and no label.
-    """
+    """Scores of the samples with a prediction and a label that is one of the net's classes."""
 
     all: Count
-    balanced: float
-    majority: tuple[str, int]
-    confidence: float
+    balanced: float  # mean over the classes that are there of the share that is right
+    majority: tuple[str, int]  # the commonest label, and how many have it
+    confidence: float  # mean over all of them
     tiers: dict[str, Count]
-    kinds: dict[str, tuple[Count, Count]]
-    confusion: Int[np.ndarray, "c c"]
-    unknown: dict[str, int]
+    kinds: dict[str, tuple[Count, Count]]  # by what was wrong with a cloud: with it, without it
+    confusion: Int[np.ndarray, "c c"]  # how often each label (row) was called each class
+    unknown: dict[str, int]  # labels that are not among the net's classes, and how often
     unlabelled: int
 
 
