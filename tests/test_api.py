@@ -7,10 +7,8 @@ from hydra.core.hydra_config import HydraConfig
 
 import qs3
 from qs3.api import generate, train
-from qs3.config.compose import composed
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.report.run_files import read_run
-from qs3.report.tables.table import build_table
 from qs3.runs.metrics import read_metrics
 from qs3.tools.toy import SHAPES, ToyNet, toy_overrides, write_toy
 
@@ -48,14 +46,8 @@ def test_train_leaves_what_the_command_leaves(tmp_path):
     assert train(*toy_overrides(tmp_path), *SHORT, "seed=3") == folder  # not trained again
     assert (folder / "metrics.json").stat().st_mtime_ns == written
     assert qs3.load(folder, packages=("qs3",)).classes == tuple(SHAPES)
-    with pytest.raises(DataError, match=r"refused. .* of your own, name its package: qs3\.load"):
+    with pytest.raises(DataError, match="refused"):
         qs3.load(folder)
-
-
-@pytest.mark.parametrize("word", ["nonsense=1", "model=nothing", "seed", "data.nothing=1"])
-def test_wrong_words_are_errors_for_people(word):
-    with pytest.raises(ConfigError, match=word.split("=")[0].split(".")[-1]):
-        composed("train", word)
 
 
 @pytest.mark.parametrize(
@@ -88,12 +80,3 @@ def test_generate(tmp_path):
     few = ["classes=[chair]", "catalogue.train=1", "catalogue.test=1", "workers=0"]
     made = generate("domain=modelnet10", *few, f"paths.data_dir={tmp_path}")
     assert made.ids == ("chair/train/chair_0000", "chair/test/chair_0000")
-
-
-def test_a_table_of_ones_own(tmp_path):
-    file = tmp_path / "mine.yaml"
-    text = "title: T\nnotes: [a line]\nmetrics: [accuracy]\ncolumns: [c]\nrows:\n"
-    file.write_text(text + "  - {name: r, c: {run: experiment=quickstart}}\n")
-    table = build_table(str(file), tmp_path / "logs")
-    assert (table.name, list(table.rows)) == ("mine", ["r"])
-    assert "experiment=quickstart" in table.cells[0].command

@@ -15,20 +15,20 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "notebooks"
-NAMES = ("01_sensor", "02_qbst", "03_results", "04_pyg")
+NAMES = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
 
 
 def read(name):
     return nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
 
 
-def run(name, folder, **environment):
+def run(name, folder):
     """The notebook with its outputs; an error in a cell is an error here."""
     # Not pytest's folder: the path of a socket must be short.
     with tempfile.TemporaryDirectory(prefix="qs3-") as scratch:
         out = Path(scratch, "out.ipynb")
         words = [ROOT / "tests" / "run_notebook.py", FOLDER / f"{name}.ipynb", out, folder, scratch]
-        env = {**os.environ, "TMPDIR": scratch, **environment}
+        env = {**os.environ, "TMPDIR": scratch}
         done = subprocess.run(
             [sys.executable, *map(str, words)], env=env, capture_output=True, text=True, check=False
         )
@@ -58,22 +58,9 @@ def images(notebook):
 def test_clean_in_git(name):
     notebook = read(name)
     nbformat.validate(notebook)
-    assert (notebook.nbformat, notebook.nbformat_minor) == (4, 5)
-    ids = [cell.id for cell in notebook.cells]
-    assert len(set(ids)) == len(ids)
-    assert set(notebook.metadata) == {"kernelspec", "language_info"}
-    assert notebook.metadata.language_info == {"name": "python"}  # no version of somebody's Python
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    for cell in code:
-        assert cell.outputs == []
-        assert cell.execution_count is None
-        assert cell.metadata == {}
-    assert sum(cell.cell_type == "markdown" for cell in notebook.cells) >= 0.6 * len(code)
-    assert notebook.cells[0].cell_type == "markdown"
-
-
-def test_every_notebook_is_tested():
-    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == sorted(NAMES)
+    assert notebook.metadata.language_info == {"name": "python"}  # no version of one's own Python
+    for cell in (cell for cell in notebook.cells if cell.cell_type == "code"):
+        assert (cell.outputs, cell.execution_count, cell.metadata) == ([], None, {})
 
 
 @pytest.mark.slow
@@ -123,14 +110,6 @@ def test_03_results():
     for row in ("source only", "QBST", "mu = 1"):
         assert re.search(rf"\| {row} +\| [\d.]+ ± [\d.]+ \(n=2\)", table)
     assert "160 test clouds" in text
-
-
-@pytest.mark.slow
-def test_03_results_of_own_runs(tmp_path):
-    done = run("03_results", FOLDER, LOG_DIR=str(tmp_path / "logs"), TABLE="quickstart")
-    text = printed(done)
-    assert f"runs of {tmp_path / 'logs'}" in text
-    assert "no finished run is in this table" in text
 
 
 @pytest.mark.slow

@@ -18,7 +18,6 @@ from omegaconf import OmegaConf
 
 from qs3.config.compose import composed, override, quoted
 from qs3.errors import ConfigError
-from qs3.report.tables.running import Job, launch
 from qs3.tools.toy import toy_overrides
 
 APP = """
@@ -90,13 +89,9 @@ def test_odd_names_of_folders_survive_a_shell():
         assert understood(word) == text
 
 
-@pytest.mark.parametrize("text", ["/home/me/logs", "a_b-c.d", "../x", "dgcnn", "a+b"])
-def test_plain_words_stay_as_they_are(text):
-    assert quoted(text) == text
-
-
-def test_an_interpolation_stays_one_where_it_was_typed():
-    assert quoted("${paths.data_dir}/x") == "${paths.data_dir}/x"
+def test_plain_words_and_interpolations_stay_as_they_are():
+    for text in ("/home/me/logs", "a_b-c.d", "../x", "a+b", "${paths.data_dir}/x"):
+        assert quoted(text) == text
 
 
 @pytest.mark.slow
@@ -108,14 +103,3 @@ def test_every_path_of_ours_reaches_the_config(tmp_path):
     assert paths == [str(folder / part) for part in ("data", "logs", "warmups")]
     assert cfg.data.target.path == str(folder / "data" / "toy_target")
     assert list(cfg.data.source.classes) == ["ball", "rod", "slab", "plank"]
-
-
-@pytest.mark.slow
-def test_a_launched_job_finds_its_folder(tmp_path):
-    """It ends there, because there are no data."""
-    folder = tmp_path / "a, b (c) [d] it's"
-    paths = override("paths.log_dir", folder), override("paths.data_dir", folder / "data")
-    job = Job("r", ("experiment=quickstart", *paths))
-    assert launch([job], "joblib", 1, str(folder)) == 1
-    (config,) = folder.glob("quickstart/seed0-*/.hydra/config.yaml")
-    assert OmegaConf.load(config).paths.data_dir == str(folder / "data")

@@ -21,8 +21,6 @@ import torch
 import yaml
 from huggingface_hub import PyTorchModelHubMixin
 from hydra.utils import instantiate
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import nn
 
 import qs3
@@ -64,26 +62,18 @@ def changed(run: Path, folder: Path, **values: Any) -> Path:
     return folder / "result.pt"
 
 
-@settings(max_examples=25, deadline=None)
-@given(
-    points=st.integers(1, 64),
-    gravity=st.sampled_from(["z", "none"]),
-    classes=st.lists(st.text(min_size=1), min_size=2, max_size=5, unique=True),
-    low=st.floats(allow_nan=False, allow_infinity=False, width=64),
-)
-def test_written_is_read(tmp_path_factory, run, points, gravity, classes, low):
+def test_written_is_read(tmp_path, run):
     result = replace(
         read_result(run),
-        points=points,
-        gravity=gravity,
-        classes=tuple(classes),
-        usual={"height": [low, float("inf")]},
-        learnt=(1 / len(classes),) * len(classes),
+        points=17,
+        gravity="none",
+        classes=("é", "a b", "\n"),
+        usual={"height": [0.1 + 0.2, float("inf")]},
+        learnt=(0.2, 1 / 3, 1e-300),
     )
-    file = tmp_path_factory.mktemp("written") / "result.pt"
-    write_result(file, result)
-    export_folder(file, file.parent / "model")
-    for place in (file, file.parent / "model"):
+    write_result(tmp_path / "result.pt", result)
+    export_folder(tmp_path / "result.pt", tmp_path / "model")
+    for place in (tmp_path / "result.pt", tmp_path / "model"):
         again = read_result(place)
         for field in ("points", "gravity", "classes", "usual", "model", "held_out", "learnt"):
             assert getattr(again, field) == getattr(result, field)
@@ -120,7 +110,7 @@ def test_a_damaged_config_is_named(folder, text):
     with pytest.raises(DataError, match=CONFIG):
         qs3.load(folder)
     (folder / CONFIG).unlink()
-    with pytest.raises(DataError, match=CONFIG):
+    with pytest.raises(MissingDataError, match=CONFIG):
         qs3.load(folder)
 
 
@@ -149,9 +139,7 @@ def test_pickles_are_refused_unopened(run, tmp_path):
         {"_target_": "qs3.models.os.mkdir", "path": "{mark}"},
         {"_target_": "qs3.models.base.nn.Linear", "in_features": 1, "out_features": 1},
         {"_target_": "qs3.models.base.DataError"},  # defined elsewhere
-        {"_target_": "qs3.models.dgcnn._PooledLinear"},
         {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": {"_target_": "os.getcwd"}},
-        {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "_partial_": True},
         {"_target_": "qs3.models.dgcnn.nothing", "num_classes": 3},
         {"_target_": "qs3.models.nothing.dgcnn", "num_classes": 3},
         {"_target_": "qs3.kernels.norms.head_norm", "kind": "batch"},  # ours, but gives no net
@@ -193,29 +181,19 @@ def test_a_net_of_ones_own_is_asked_for_by_package_or_module(run, tmp_path, pack
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("classes", ["only"]),
-        ("points", 0),
-        ("stored_points", "many"),
-        ("gravity", "down"),
-        ("scale", "feet"),
-        ("target", None),
-        ("usual", [1]),
-        ("weights", {"a": 1}),
+        ("classes", ["only"]), ("points", 0), ("stored_points", "many"), ("gravity", "down"),
+        ("scale", "feet"), ("target", None), ("usual", [1]), ("weights", {"a": 1}),
         ("colour", "red"),
     ],
-    ids=str,
-)
+)  # fmt: skip
 def test_damaged_values_are_named(run, tmp_path, key, value):
     with pytest.raises(DataError, match=key):
         qs3.load(changed(run, tmp_path, **{key: value}))
 
 
-def test_weights_of_another_net_are_refused(run, tmp_path):
+def test_weights_of_another_net_and_truncated_files_are_refused(run, tmp_path):
     with pytest.raises(DataError, match="dgcnn"):
         qs3.load(changed(run, tmp_path, weights={"a": torch.zeros(1)}))
-
-
-def test_truncated_files_are_damaged(run, tmp_path):
     data = (run / "result.pt").read_bytes()
     for size in (0, 10, len(data) // 2, len(data) - 1):
         (tmp_path / "cut.pt").write_bytes(data[:size])
@@ -229,9 +207,6 @@ def test_what_is_not_a_run_is_missing(run, tmp_path):
             qs3.load(place)
     with pytest.raises(ConfigError):
         qs3.load(tmp_path / "model.onnx")
-
-
-# --- cards --------------------------------------------------------------------------------------
 
 
 def test_the_card_holds_what_the_run_knows(run, folder, tmp_path):
@@ -269,9 +244,6 @@ def test_what_is_there_stays(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
     assert main(["export", f"ckpt={run}", f"out={tmp_path / 'model'}"]) == 0
     assert main(["export", f"ckpt={tmp_path / 'model'}", f"out={tmp_path / 'model'}"]) == 1
-
-
-# --- what comes with qs3, and hubs ---------------------------------------------------------------
 
 
 def test_what_comes_with_qs3_is_whole_and_knows_scans_of_meshes_it_never_saw():
