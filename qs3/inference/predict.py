@@ -18,7 +18,7 @@ from qs3.evaluation.ood import other_units
 from qs3.inference.inputs import Sample
 from qs3.inference.model_file import find_result
 from qs3.inference.predictor import Predictor, load
-from qs3.inference.table import Count, disputed, right, scores
+from qs3.inference.table import Count, disputed, scores
 from qs3.kernels.norms import use_trained
 from qs3.runs.metrics import read_metrics
 
@@ -178,7 +178,7 @@ def _agreement(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
     parts = []
     for words, differs in (("agrees on", False), ("differs on", True)):
         some = [one for one in asked if disputed(one) is differs]
-        judged = [right(one, classes) for one in some if one.label in classes]
+        judged = [one.cls == one.label for one in some if one.label in classes]
         share = f" ({np.mean(judged):.0%} right)" if judged else ""
         parts.append(f"{words} {len(some)}{share}")
     line = f"a second classifier {', '.join(parts)} (column second); inspect disagreements"
