@@ -27,9 +27,6 @@ NAMES = sorted({path.stem for path in (CONF / "domain").glob("*.yaml")} - {PACKA
 SPLITS = {"train": 2, "test": 1}
 
 
-FORTY = ("specklenet40",)
-
-
 def domain(name, data_dir, *overrides):
     """As train.py would mount it, in a config of our own."""
     mounted = [f"+domain@data.source={name}", "+paths=default", f"paths.data_dir={data_dir}"]
@@ -62,11 +59,11 @@ def test_every_domain_opens_on_its_fixture(tmp_path, name):
     found = domain(name, tmp_path)
     found.check()
     data = found.open()
-    counts, small = data.counts(), ("shapenet10", "modelnet10_arrays", "graspnetpc10")
+    counts, small = data.counts(), ("shapenet10", "graspnetpc10")
     both = 2 if name == "graspnetpc10" else 1  # sensors
     absent = {"bathtub", "lamp", "plant"} if name == "scanobjectnn" else set()
     assert data.classes == found.names
-    assert (data.classes == CLASSES) == (name not in ("graspnetpc10", *FORTY))
+    assert (data.classes == CLASSES) == (name != "graspnetpc10")
     for split, each in (("train", 2 * both), ("test", 1)):
         if (name, split) == ("graspnetpc10", "test"):
             assert split not in counts

@@ -9,10 +9,10 @@ from tests.generation.generating import config
 
 def test_generated_from_meshes(tmp_path):
     write_off_tree(tmp_path / "meshes", {"train": 1, "test": 1}, MODELNET40)
-    cfg = config(tmp_path / "data", tmp_path / "meshes", "workers=1", domain="specklenet40")
+    cfg = config(tmp_path / "data", tmp_path / "meshes", "workers=1", "+domain.classes=modelnet40")
     cfg.classes = ["airplane", "night_stand", "xbox"]
     generate(cfg)
-    data = open_pointset(tmp_path / "data" / "specklenet40")
+    data = open_pointset(tmp_path / "data" / "specklenet10")
     assert data.classes == MODELNET40
     assert data.ids == tuple(
         f"{c}/{s}/{c}_000{i}"
