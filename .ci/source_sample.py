@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.datamodules.fps_samples import sample
-from qs3.store.manifest import OK, read_manifest
+from qs3.store.meta import OK, read_manifest
 from qs3.store.store import open_pointset
 
 POINTS = 512

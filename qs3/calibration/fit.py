@@ -102,7 +102,9 @@ def fit_walls(
         raise ConfigError("expected depth images of one size: qs3 fit frames/*.png ...")
     height, width = frames[0].shape
     if intrinsics is not None:
-        pinhole = check_intrinsics(read_intrinsics(intrinsics), frames[0], f"{intrinsics=}")
+        given = read_intrinsics(intrinsics)
+        check_intrinsics(given, frames[0], f"{intrinsics=}")
+        pinhole = given.camera
         middle_px = (pinhole.fx_px + pinhole.fy_px) / 2
         camera = Intrinsics(width, height, middle_px, pinhole.cx_px, pinhole.cy_px)
     elif focal is not None:

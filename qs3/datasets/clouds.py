@@ -40,8 +40,7 @@ from qs3.datasets.importing import (
     visible,
 )
 from qs3.errors import DataError
-from qs3.store.manifest import ManifestRow
-from qs3.store.meta import MadeOf
+from qs3.store.meta import MadeOf, ManifestRow
 from qs3.utils.files import reading
 from qs3.utils.settings import settings
 
@@ -93,13 +92,6 @@ def parse_cloud(path: str | Path) -> np.ndarray:
     if len(found.clouds) != 1:
         raise DataError(f"{path} holds {len(found.clouds)} clouds, expected one")
     return found.clouds[0]
-
-
-def npy_clouds(path: Path) -> int | None:
-    """How many clouds an .npy file is made for, without reading them; None: a single one."""
-    with reading(path):
-        found = _of_array(np.load(path, mmap_mode="r", allow_pickle=False))
-    return len(found.clouds) if found.many else None
 
 
 def read_arrays(

@@ -167,13 +167,6 @@ def read_depth(
     return depth
 
 
-def check_metres(depth_m: Float[np.ndarray, "h w"], where: str) -> None:
-    """Raise DataError, which begins with `where`, if these are no metres but millimetres."""
-    measured = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
-    if measured.size and (middle := float(np.median(measured))) >= MOST_DEPTH_M:
-        raise DataError(f"{where}: the median depth is {middle:.4g} m; are these millimetres?")
-
-
 def read_mask(path: str | Path) -> Int[np.ndarray, "h w"]:
     """Number of the object that each pixel shows, int64; 0 where it shows none."""
     return checked_mask(_image(Path(path), "iub"), str(path))
@@ -222,8 +215,14 @@ def camera_of(values: Sequence[float], where: str) -> Pinhole:
         raise DataError(f"{where}: expected fx,fy,cx,cy or a camera's 3 x 3 matrix") from error
 
 
-def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where: str) -> Pinhole:
-    """The camera, if it can have taken a picture of this size."""
+def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where: str) -> str:
+    """Raise DataError if this camera cannot have taken this picture, or it is in millimetres.
+
+    Returns:
+        Why the camera may be that of a picture of another size; "" if nothing says so. Lenses sit
+        before the middle of their sensors to a few per cent of its sides, but of a crop the centre
+        may lie anywhere. A file that has the picture's size is believed.
+    """
     height, width = depth_m.shape
     camera = given.camera
     fields = np.degrees(2 * np.arctan([width / camera.fx_px / 2, height / camera.fy_px / 2]))
@@ -236,17 +235,9 @@ def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where
             f"view of {fields[0]:.1f}° x {fields[1]:.1f}°, and pictures of {given.size}: are the "
             "intrinsics those of another resolution, or is it a crop?"
         )
-    return camera
-
-
-def off_centre(given: Intrinsics, depth_m: Float[np.ndarray, "h w"]) -> str:
-    """Why the camera may be that of a picture of another size, in words; "" if nothing says so.
-
-    Lenses sit before the middle of their sensors to a few per cent of its sides. Of a crop the
-    centre may lie anywhere, so this is no error. A file that has the picture's size is believed.
-    """
-    height, width = depth_m.shape
-    camera = given.camera
+    measured = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
+    if measured.size and (middle := float(np.median(measured))) >= MOST_DEPTH_M:
+        raise DataError(f"{where}: the median depth is {middle:.4g} m; are these millimetres?")
     off = abs(camera.cx_px - (width - 1) / 2) / width, abs(camera.cy_px - (height - 1) / 2) / height
     if given.size is not None or max(off) <= _OFF:
         return ""

@@ -12,8 +12,8 @@ import abc
 import functools
 import logging
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,9 +24,9 @@ from annotated_types import Ge
 from jaxtyping import Float
 
 from qs3.datasets.cutting import Piece, Rules
-from qs3.datasets.importing import Importer, Item, check_cloud, report, thinned
+from qs3.datasets.importing import Importer, Item, by_class, check_cloud, report, thinned
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.store.manifest import OK, SPLITS, ManifestRow
+from qs3.store.meta import OK, ManifestRow
 from qs3.store.parts import PartFiles
 from qs3.utils.files import reading
 from qs3.utils.pool import Processes
@@ -74,30 +74,9 @@ def frame_task(
     return FrameTask(f"{number:06d}", stem, split, number, sensor, vertical, known)
 
 
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """One object of a frame, cut or refused.
-
-    Attributes:
-        cls: its class.
-        origin: for a human.
-        points_m: [n, 3] float32, z up.
-        pixels: with depth.
-        reason: why it cannot be used; "" otherwise.
-        more: further columns of the manifest.
-        views: frames that it was cut from.
-    """
-
-    cls: str
-    origin: str
-    points_m: Float[np.ndarray, "n 3"]
-    pixels: int
-    reason: str
-    more: dict[str, str]
-    views: int = 1
-
-
-Cutter = Callable[[FrameTask], list[Cut]]
+Cutter = Callable[[FrameTask], list[tuple[ManifestRow, Float[np.ndarray, "n 3"]]]]
+"""The objects of a frame: class, origin and figures of each, its reason if it is left out; and its
+points, float32, z up."""
 
 
 @settings
@@ -135,34 +114,32 @@ class CutDataset(Importer):
 
     def settings(self) -> dict[str, Any]:
         """See `Importer`."""
-        values = super().settings()
-        del values["workers"]
-        return values
+        return {key: value for key, value in super().settings().items() if key != "workers"}
 
     def read(
         self, classes: Sequence[str], work: Path
     ) -> tuple[list[np.ndarray], list[ManifestRow]]:
         """See `Importer`: cuts what is not cut yet, then puts all together."""
-        parts, tasks, failed = self._begun(work), self.tasks(), {}
+        parts, tasks = self._begun(work), self.tasks()
         todo = [(task.name, task) for task in tasks if not parts.has(task.name)]
         make = functools.partial(_worker, self)
         with progress_bar(f"cutting objects from {self.root.name}", total=len(todo)) as advance:
             for outcome in Processes(self.workers).run(make, todo) if todo else ():
-                result = outcome.result or f"{outcome.name}: its process died (out of memory?)"
-                if not isinstance(result, str):
-                    parts.write(outcome.name, *result)
-                elif self.on_error == "stop":
-                    raise DataError(result)
-                else:
-                    failed[outcome.name] = result
+                if not isinstance(outcome.result, tuple):
+                    raise DataError(outcome.result or f"{outcome.name}: its process died")
+                parts.write(outcome.name, *outcome.result)
                 advance()
-        found = [one for task in tasks for one in self._of_task(parts, task, failed)]
-        label = {name: i for i, name in enumerate(classes)}
-        found.sort(key=lambda f: (SPLITS.index(f[0].split), label.get(f[0].cls, -1), f[0].id))
-        rows = [row for row, _ in found]
-        clouds = [cloud for _, cloud in found if cloud is not None]
+        found = []
+        for task in tasks:
+            note, arrays = parts.read(task.name)
+            for i, one in enumerate(note["rows"]):
+                found.append(
+                    Item(ManifestRow(**one), functools.partial(arrays.__getitem__, str(i)))
+                )
+        found = by_class(found, classes)
+        rows = [item.row for item in found]
         report(rows, classes, self.points, self.root)
-        return clouds, rows
+        return [item.load() for item in found if item.row.status == OK], rows
 
     def _begun(self, work: Path) -> PartFiles:
         """The folder of parts: those of the same settings and versions, or none."""
@@ -181,42 +158,10 @@ class CutDataset(Importer):
             parts.begin(recipe)
         return parts
 
-    def _of_task(
-        self, parts: PartFiles, task: FrameTask, failed: Mapping[str, str]
-    ) -> Iterator[tuple[ManifestRow, np.ndarray | None]]:
-        """Rows of one frame's objects with their clouds."""
-        more = {"frame": str(task.number), "sensor": task.sensor, "vertical": task.vertical}
-        if task.name in failed:
-            id_, why = f"{task.split}/{task.stem}", failed[task.name]
-            yield ManifestRow(id_, "", task.split, status="skipped", reason=why, more=more), None
-            return
-        note, arrays = parts.read(task.name)
-        for i, one in enumerate(note["objects"]):
-            row = ManifestRow(
-                f"{one['cls']}/{task.split}/{task.stem}_{i}",
-                one["cls"],
-                task.split,
-                origin=one["origin"],
-                views=one["views"],
-                valid_points=one["pixels"],
-                status="skipped" if one["reason"] else OK,
-                reason=one["reason"],
-                more={key: value for key in COLUMNS if (value := (more | one["more"]).get(key))},
-            )
-            cloud = None if row.reason else check_cloud(arrays[str(i)], self.points, row.id)
-            yield row, cloud
-
 
 @settings
 class FrameDataset(CutDataset):
-    """A dataset of depth images.
-
-    Attributes:
-        names: name in the dataset -> class; names that are not in it are left alone.
-        rules: as `qs3.datasets.cutting.Rules`.
-        tiers: which of "clean" and "hard" become clouds.
-        block: so many frames in a row make a cluster, where rooms are not known.
-    """
+    """A dataset of depth images; conf/domain/nyuv2.yaml explains its settings."""
 
     names: dict[str, str] = field(default_factory=dict)
     rules: Rules = field(default_factory=Rules)
@@ -232,7 +177,7 @@ class FrameDataset(CutDataset):
             raise ConfigError(f"published.names or rules.limits: unknown classes {unknown}")
         return super().read(classes, work)
 
-    def cut_of(self, name: str, origin: str, piece: Piece) -> Cut:
+    def row_of(self, name: str, origin: str, piece: Piece) -> ManifestRow:
         """What was cut of a thing that the dataset calls `name`."""
         more, points, reason = {"sub": name}, len(piece.points_m), piece.why
         if piece.refused:
@@ -241,7 +186,14 @@ class FrameDataset(CutDataset):
             more |= {"tier": piece.tier, "why": piece.why, "depth_m": f"{piece.depth_m:.3f}"}
             more |= {key: f"{getattr(piece, key):.3f}" for key in ("holes", "rim", "occ")}
             reason = "" if piece.tier in self.tiers else f"{piece.tier} ({piece.why})"
-        return Cut(self.names[name], origin, piece.points_m, points, reason, more)
+        return cut_row(self.names[name], origin, 1, points, reason, more)
+
+
+def cut_row(
+    cls: str, origin: str, views: int, points: int, reason: str, more: Mapping[str, str]
+) -> ManifestRow:
+    """An object of so many views and points, as far as a `Cutter` knows its row."""
+    return ManifestRow("", cls, "", None, "", origin, views, points, reason=reason, more=more)
 
 
 def _worker(dataset: CutDataset) -> Callable[[FrameTask], Part | str]:
@@ -249,17 +201,24 @@ def _worker(dataset: CutDataset) -> Callable[[FrameTask], Part | str]:
     cut = dataset.cutter()
 
     def work(task: FrameTask) -> Part | str:
+        more = {"frame": str(task.number), "sensor": task.sensor, "vertical": task.vertical}
+        rows, clouds = [], {}
         try:
-            found = cut(task)
+            for i, (row, points) in enumerate(cut(task)):
+                id_, all_ = f"{row.cls}/{task.split}/{task.stem}_{i}", {**more, **row.more}
+                if not row.reason:
+                    cloud = thinned(points, dataset.points)
+                    clouds[str(i)] = check_cloud(cloud, dataset.points, id_)
+                status = "skipped" if row.reason else OK
+                kept = {key: all_[key] for key in COLUMNS if all_.get(key)}
+                rows.append(replace(row, id=id_, split=task.split, status=status, more=kept))
         except Qs3Error as error:
-            return str(error)
-        clouds = {
-            str(i): thinned(one.points_m, dataset.points)
-            for i, one in enumerate(found)
-            if not one.reason
-        }
-        keys = ("cls", "origin", "pixels", "reason", "more", "views")
-        return {"objects": [{key: getattr(one, key) for key in keys} for one in found]}, clouds
+            if dataset.on_error == "stop":
+                return str(error)
+            id_, clouds = f"{task.split}/{task.stem}", {}
+            reason = str(error)
+            rows = [ManifestRow(id_, "", task.split, status="skipped", reason=reason, more=more)]
+        return {"rows": list(map(asdict, rows))}, clouds
 
     return work
 

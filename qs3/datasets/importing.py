@@ -25,9 +25,8 @@ from jaxtyping import Float
 
 from qs3.classes import known_as
 from qs3.errors import DataError
-from qs3.store.manifest import SPLITS, ManifestRow
-from qs3.store.meta import MadeOf
-from qs3.store.store import is_begun, is_finished, write_pointset
+from qs3.store.meta import SPLITS, MadeOf, ManifestRow, is_begun, is_finished
+from qs3.store.store import write_pointset
 from qs3.utils.locks import locked
 from qs3.utils.progress import shown
 from qs3.utils.settings import settings

@@ -20,8 +20,7 @@ import numpy as np
 
 from qs3.datasets.importing import Importer, Item, by_class
 from qs3.errors import DataError
-from qs3.store.manifest import OK, read_manifest
-from qs3.store.meta import META, MadeOf
+from qs3.store.meta import META, OK, MadeOf, read_manifest
 from qs3.store.store import open_pointset
 from qs3.utils.settings import settings
 

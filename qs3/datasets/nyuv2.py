@@ -36,10 +36,10 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.datasets.cutting import cut
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
-from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, frame_task, load_mat
+from qs3.datasets.frames import Cutter, FrameDataset, FrameTask, frame_task, load_mat
 from qs3.datasets.vertical import floor_up, planes_up
 from qs3.errors import DataError
-from qs3.store.meta import MadeOf
+from qs3.store.meta import MadeOf, ManifestRow
 from qs3.utils.files import reading
 from qs3.utils.progress import shown
 from qs3.utils.settings import settings
@@ -133,12 +133,7 @@ def read_splits(path: Path, frames: int) -> list[str]:
 
 @settings
 class NYUv2(FrameDataset):
-    """See the module.
-
-    Attributes:
-        file, splits: names of nyu_depth_v2_labeled.mat and splits.mat in the folder.
-        with_contents: name -> names of things that belong to it where they lie within its outline.
-    """
+    """See the module; conf/domain/nyuv2.yaml explains its settings."""
 
     file: str = "nyu_depth_v2_labeled.mat"
     splits: str = "splits.mat"
@@ -176,7 +171,7 @@ class NYUv2(FrameDataset):
         """See `FrameDataset`."""
         frames = LabelledFrames(self.root / self.file)
 
-        def cut_frame(task: FrameTask) -> list[Cut]:
+        def cut_frame(task: FrameTask) -> list[tuple[ManifestRow, np.ndarray]]:
             index = task.number - 1
             image = DepthImage(frames.depth_m(index), CAMERA, task.known, frames.area)
             labels, instances = frames.labels(index), frames.instances(index)
@@ -193,7 +188,7 @@ class NYUv2(FrameDataset):
                     mask |= self._contents(name, mask, labels, frames.names)
                     piece = cut(image, mask, self.names[name], self.rules)
                     origin = f"{self.file}, frame {task.number}, {name} {instance}"
-                    cuts.append(self.cut_of(name, origin, piece))
+                    cuts.append((self.row_of(name, origin, piece), piece.points_m))
             return cuts
 
         return cut_frame

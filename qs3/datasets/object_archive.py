@@ -36,8 +36,7 @@ from jaxtyping import Float
 from qs3.datasets.clouds import read_arrays
 from qs3.datasets.importing import Importer, Item, by_class, class_of
 from qs3.errors import ConfigError
-from qs3.store.manifest import ManifestRow
-from qs3.store.meta import MadeOf
+from qs3.store.meta import MadeOf, ManifestRow
 from qs3.utils.files import reading
 from qs3.utils.settings import settings
 
@@ -108,19 +107,7 @@ class Archive:
 
 @settings
 class ObjectArchive(Importer):
-    """See the module.
-
-    Attributes:
-        file: the .npz, in the folder or by its whole path.
-        train_parts, test_parts: values of `dev` that are for training and for test; others are
-            left out. An archive without `dev` is all for test.
-        fold, folds: instead, `train_parts` alone, cut into `folds` runs of blocks, of which number
-            `fold` (from 0) is for test and the others for training.
-        gap: frames next to a fold's test blocks that are left out of its training part.
-        block: so many frames in a row make a cluster.
-        inliers_only: leave stray points out.
-        tiers: which of "clean" and "hard".
-    """
+    """See the module; conf/domain/objects.yaml explains its settings."""
 
     file: str = "objects.npz"
     train_parts: list[str] = field(default_factory=lambda: [ADAPT])

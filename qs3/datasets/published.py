@@ -30,8 +30,7 @@ from qs3.datasets.importing import (
     split_of,
     turned,
 )
-from qs3.store.manifest import SPLITS, ManifestRow
-from qs3.store.meta import MadeOf
+from qs3.store.meta import SPLITS, MadeOf, ManifestRow
 from qs3.utils.files import reading
 from qs3.utils.seeding import derive
 from qs3.utils.settings import Count, settings

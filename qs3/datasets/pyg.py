@@ -29,9 +29,8 @@ from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.neighbours import knn
 from qs3.geometry.sampling import farthest_point_sampling_np
-from qs3.store.manifest import ManifestRow
-from qs3.store.meta import MadeOf
-from qs3.store.store import PointSet, is_begun, is_finished, write_pointset
+from qs3.store.meta import MadeOf, ManifestRow, is_begun, is_finished
+from qs3.store.store import PointSet, write_pointset
 
 
 class Clouds(InMemoryDataset):

@@ -29,7 +29,7 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Bool, Float, Int, UInt
 
-from qs3.datasets.frames import Cut, CutDataset, Cutter, FrameTask
+from qs3.datasets.frames import CutDataset, Cutter, FrameTask, cut_row
 from qs3.datasets.scannet_files import (
     INSTANCES,
     LABELS,
@@ -44,7 +44,7 @@ from qs3.datasets.scannet_files import (
     read_scene_list,
 )
 from qs3.errors import DataError
-from qs3.store.meta import MadeOf
+from qs3.store.meta import MadeOf, ManifestRow
 from qs3.utils.files import reading
 from qs3.utils.settings import Count, settings
 
@@ -117,7 +117,9 @@ def _files(scene: Path) -> list[Path]:
     return [scene / f"{scene.name}{suffix}" for suffix in SUFFIXES]
 
 
-def _extract(data: ScanNet, task: FrameTask, label_map: LabelMap) -> list[Cut]:
+def _extract(
+    data: ScanNet, task: FrameTask, label_map: LabelMap
+) -> list[tuple[ManifestRow, np.ndarray]]:
     """The objects of a scene: points in the scene's world, metres, z up."""
     sens, instances, labels, aggregation = _files(task.known)
     labelled = read_objects(aggregation, label_map)
@@ -145,7 +147,7 @@ def _extract(data: ScanNet, task: FrameTask, label_map: LabelMap) -> list[Cut]:
             reason = "the label masks of its chosen frames give it another class"
         origin = f"scene {task.stem}, object {one.object_id}, label {one.label!r}, frames "
         origin += f"{' '.join(map(str, used)) or 'none'}, of {len(sightings[one])}"
-        found.append(Cut(one.cls, origin, points, len(points), reason, {}, len(used)))
+        found.append((cut_row(one.cls, origin, len(used), len(points), reason, {}), points))
     return found
 
 

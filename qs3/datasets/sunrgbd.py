@@ -25,9 +25,9 @@ column of the manifest is 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -35,8 +35,8 @@ from jaxtyping import Float
 
 from qs3.datasets.cutting import Box, Piece, box_mask, cut
 from qs3.datasets.depth_images import DepthImage, Pinhole
-from qs3.datasets.frames import Cut, Cutter, FrameDataset, FrameTask, frame_task, load_mat
-from qs3.store.meta import MadeOf
+from qs3.datasets.frames import Cutter, FrameDataset, FrameTask, frame_task, load_mat
+from qs3.store.meta import MadeOf, ManifestRow
 from qs3.utils.files import reading
 from qs3.utils.settings import settings
 
@@ -51,18 +51,11 @@ _SWAPPED = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """(x, y, z) of the camera to the toolbox's (x, z, -y)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One entry of the table.
+class Frame(NamedTuple):
+    """One entry of the table, counted from 1; `folder` is relative to the archive.
 
-    Attributes:
-        number: in the table, from 1.
-        sensor: one of `SENSORS`.
-        folder: of the frame, relative to the archive, e.g. "SUNRGBD/kv2/align_kv2/2014...".
-        camera: of the depth image.
-        world_from_camera: [3, 3] rotation to z up.
-        boxes: the authors' words for the things in it, and their boxes in the frame with z up; None
-            where the numbers are not those of a box: people drew thousands.
+    `boxes` are the authors' words for the things in it, and their boxes in the frame with z up;
+    None where the numbers are not those of a box: people drew thousands.
     """
 
     number: int
@@ -108,12 +101,7 @@ def millimetres(rotated: np.ndarray) -> Float[np.ndarray, "h w"]:
 
 @settings
 class SUNRGBD(FrameDataset):
-    """See the module.
-
-    Attributes:
-        sensors: whose frames are cut.
-        splits: allsplit.mat, relative to the folder.
-    """
+    """See the module; conf/domain/sunrgbd.yaml explains its settings."""
 
     sensors: list[Sensor] = field(default_factory=lambda: list(SENSORS))
     splits: str = SPLITS
@@ -130,17 +118,16 @@ class SUNRGBD(FrameDataset):
         """See `FrameDataset`; frames of the chosen sensors that are of a split."""
         splits = read_splits(self.root, self.splits)
         return [
-            frame_task(one.number, split, _cluster(one, self.block), one.sensor, "published")
+            frame_task(one.number, split, _cluster(one, self.block), one.sensor, "published", one)
             for one in read_frames(self.root)
             if one.sensor in self.sensors and (split := splits.get(one.folder))
         ]
 
     def cutter(self) -> Cutter:
         """See `FrameDataset`."""
-        frames = {one.number: one for one in read_frames(self.root)}
 
-        def cut_frame(task: FrameTask) -> list[Cut]:
-            frame = frames[task.number]
+        def cut_frame(task: FrameTask) -> list[tuple[ManifestRow, np.ndarray]]:
+            frame: Frame = task.known
             wanted = [(name, box) for name, box in frame.boxes if name in self.names]
             if not wanted:
                 return []
@@ -154,7 +141,8 @@ class SUNRGBD(FrameDataset):
                 else:
                     mask = box_mask(image, box, self.rules)
                     piece = cut(image, mask, self.names[name], self.rules, edge_px=0)
-                cuts.append(self.cut_of(name, f"{frame.folder}, {name} {number}", piece))
+                row = self.row_of(name, f"{frame.folder}, {name} {number}", piece)
+                cuts.append((row, piece.points_m))
             return cuts
 
         return cut_frame

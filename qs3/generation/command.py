@@ -37,7 +37,7 @@ from qs3.generation.workers import (
 )
 from qs3.meshes.mesh import MeshItem
 from qs3.meshes.placement import RealSize
-from qs3.store.manifest import MANIFEST
+from qs3.store.meta import MANIFEST, ManifestRow, is_finished
 from qs3.store.parts import (
     CLOUDS,
     CONFIG,
@@ -47,14 +47,7 @@ from qs3.store.parts import (
     check_ours,
     delete_dataset,
 )
-from qs3.store.store import (
-    ManifestRow,
-    PointSet,
-    counts_text,
-    is_finished,
-    open_pointset,
-    write_pointset,
-)
+from qs3.store.store import PointSet, counts_text, open_pointset, write_pointset
 from qs3.utils.files import write_text
 from qs3.utils.locks import owned
 from qs3.utils.pool import Pool

@@ -23,7 +23,6 @@ from qs3.datasets.cutting import Piece, faults
 from qs3.datasets.depth_images import (
     Intrinsics,
     check_intrinsics,
-    off_centre,
     read_depth,
     read_intrinsics,
     read_mask,
@@ -273,14 +272,9 @@ def pointed(
     gravity: str,
 ) -> Iterator[Sample]:
     """The objects of a mask, one a number, or of a box; see `qs3.datasets.pointed.point_out`."""
-    found = point_out(
-        depth_m,
-        check_intrinsics(given, depth_m, name or "the depth image"),
-        mask=mask,
-        box=box,
-        up=up,
-    )
-    unsure = [Caution("camera", words)] if (words := off_centre(given, depth_m)) else []
+    doubt = check_intrinsics(given, depth_m, name or "the depth image")
+    found = point_out(depth_m, given.camera, mask=mask, box=box, up=up)
+    unsure = [Caution("camera", doubt)] if doubt else []
     if given.bent:
         unsure.append(Caution("lens", "the camera's distortion is known and not corrected"))
     for one in found:

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
 from qs3.datasets.clouds import check_shape, checked
-from qs3.datasets.depth_images import Intrinsics, Pinhole, camera_of, check_metres
+from qs3.datasets.depth_images import Intrinsics, Pinhole, camera_of
 from qs3.datasets.importing import check_cloud, thinned, turned
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
@@ -255,7 +255,6 @@ class Predictor:
         depth = _filled(depth_m)
         if not isinstance(camera, Pinhole):
             camera = camera_of([float(value) for value in np.ravel(camera)], "camera")
-        check_metres(depth, "the depth image")
         mask = None if mask is None else _filled(mask)
         given = Intrinsics(camera)
         found = list(pointed("", depth, given, mask, box, up, self.result.gravity))

@@ -20,9 +20,8 @@ from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.meshes.placement import OnFurniture, Placing, RealSize, UnitCube
 from qs3.report.sheets import drawn
 from qs3.report.viewer import Part, Shown
-from qs3.store.manifest import ManifestRow, read_manifest
-from qs3.store.meta import MadeOf
-from qs3.store.store import PointSet, is_finished, open_pointset, open_table
+from qs3.store.meta import MadeOf, ManifestRow, is_finished, read_manifest
+from qs3.store.store import PointSet, open_pointset, open_table
 from qs3.utils.progress import progress_bar
 from qs3.utils.seeding import object_rng
 

@@ -16,7 +16,7 @@ from qs3.errors import ConfigError
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample, unit_ball
 from qs3.report.datasets import Opened, distance_to_mesh, surfaces_of
 from qs3.report.sheets import drawn
-from qs3.store.manifest import ManifestRow
+from qs3.store.meta import ManifestRow
 from qs3.store.store import PointSet
 from qs3.utils.page import render
 from qs3.utils.progress import progress_bar

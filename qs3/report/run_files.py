@@ -18,7 +18,8 @@ from qs3.runs import folder as runs
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
-from qs3.store.store import PointSet, is_finished
+from qs3.store.meta import is_finished
+from qs3.store.store import PointSet
 
 if TYPE_CHECKING:
     import pandas as pd

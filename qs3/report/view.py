@@ -22,7 +22,7 @@ from qs3.report.run_files import is_run, read_run
 from qs3.report.run_page import worst_clouds
 from qs3.report.sheets import drawn
 from qs3.report.viewer import Part, Shown, page, points_each
-from qs3.store.store import is_finished
+from qs3.store.meta import is_finished
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import printable
 

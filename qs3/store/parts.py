@@ -45,16 +45,6 @@ class PartFiles:
         self.folder = folder
         self._parts = folder / PARTS
 
-    @property
-    def are_there(self) -> bool:
-        """Whether there is a folder of parts."""
-        return self._parts.is_dir()
-
-    @property
-    def have_recipe(self) -> bool:
-        """Whether it is known what the parts, or the finished work, were made with."""
-        return (self.folder / RECIPE).is_file()
-
     def check(self, recipe: Mapping[str, Any]) -> None:
         """Compare with the recipe that is there."""
         path = self.folder / RECIPE
@@ -71,13 +61,14 @@ class PartFiles:
 
     def begin(self, recipe: Mapping[str, Any]) -> None:
         """Start, or continue what was made with the same recipe; raises as `check`."""
-        if self.have_recipe:
+        if (self.folder / RECIPE).is_file():
             self.check(recipe)
         else:
             self.clear()  # parts without a recipe: it is not known what they were made with
             write_json(self.folder / RECIPE, recipe)
         make_folder(self._parts)
-        self.tidy()
+        for folder in (self.folder, self._parts):  # what killed processes left half written
+            remove_leftovers(folder)
 
     def recipe_sha256(self) -> str:
         """Hash of what the parts are made with, as it is stored."""
@@ -94,11 +85,6 @@ class PartFiles:
                 f"{platform.node()} does not see {self.folder}, or it was begun anew: give a "
                 "folder that all nodes see, or engine.shared_disk=false (engine=ray)"
             )
-
-    def tidy(self) -> None:
-        """Remove what killed processes left half written; nothing else may be writing."""
-        remove_leftovers(self.folder)
-        remove_leftovers(self._parts)
 
     def write(self, name: str, note: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         """Write one part, atomically; `note` is what JSON can hold."""
@@ -124,14 +110,14 @@ class PartFiles:
         """Whether a part is written."""
         return self._path(name).is_file()
 
-    def count(self) -> int:
-        """How many parts are written."""
-        return len(list(self._parts.glob("*.npz")))
-
     def clear(self) -> None:
         """Remove the parts; the recipe stays."""
         if self._parts.is_dir():
             shutil.rmtree(self._parts)
+
+    def count(self) -> int:
+        """How many parts are written."""
+        return len(list(self._parts.glob("*.npz")))
 
     def _path(self, name: str) -> Path:
         return self._parts / f"{name}.npz"

@@ -25,45 +25,26 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import DataError
-from qs3.store.manifest import (
-    MANIFEST,
-    OK,
-    SPLITS,
-    ManifestRow,
-    check_rows,
-    number,
-    read_manifest,
-    to_csv,
-)
 from qs3.store.meta import (
     AGAIN,
+    MANIFEST,
     META,
+    OK,
+    SPLITS,
     MadeOf,
-    is_begun,
+    ManifestRow,
+    check_rows,
     is_finished,
+    number,
+    read_manifest,
     read_meta,
     sha256_of,
+    to_csv,
     write_meta,
 )
 from qs3.utils import text_table
 from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
 from qs3.utils.version import VERSION
-
-__all__ = [
-    "SPLITS",
-    "ManifestRow",
-    "PointSet",
-    "counts_text",
-    "evenly",
-    "has_variant",
-    "is_begun",
-    "is_finished",
-    "open_pointset",
-    "open_table",
-    "read_manifest",
-    "read_meta",
-    "write_pointset",
-]
 
 _CHUNK_CLOUDS = 512  # that are in memory at a time
 

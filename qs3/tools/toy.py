@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.config.compose import override
-from qs3.store.meta import MadeOf
-from qs3.store.store import ManifestRow, PointSet, write_pointset
+from qs3.store.meta import MadeOf, ManifestRow
+from qs3.store.store import PointSet, write_pointset
 
 SHAPES = {
     "ball": (1.0, 1.0, 1.0),

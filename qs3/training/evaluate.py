@@ -49,7 +49,7 @@ from qs3.runs.predictions import (
 )
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, WarmupSelection
 from qs3.selftraining.student_selection import StudentSelection
-from qs3.store.manifest import read_manifest
+from qs3.store.meta import read_manifest
 from qs3.training.fit import Built
 from qs3.training.load import Loaded, Shares, prior_beside, shares_of_student
 from qs3.training.run import STUDENT, Run

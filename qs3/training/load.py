@@ -23,7 +23,7 @@ from qs3.evaluation.prior import ESTIMATED, Prior, estimate_shares, read_prior, 
 from qs3.inference.model_file import Result, read_result
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf, RoundRecord
-from qs3.store.manifest import read_manifest
+from qs3.store.meta import read_manifest
 from qs3.store.store import PointSet
 from qs3.training.provenance import note_start
 from qs3.training.run import Run

@@ -26,7 +26,8 @@ from qs3.config import hashing
 from qs3.errors import MissingDataError
 from qs3.runs import folder as runs
 from qs3.runs.metrics import RunMetrics, read_metrics
-from qs3.store.store import PointSet, is_finished
+from qs3.store.meta import is_finished
+from qs3.store.store import PointSet
 from qs3.training.run import Run, run_of
 from qs3.utils.files import remove_leftovers, sha256_file
 from qs3.utils.version import VERSION, commit

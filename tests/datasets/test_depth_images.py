@@ -171,4 +171,7 @@ def test_intrinsics_that_are_not_this_pictures_are_refused(values, size):
     with pytest.raises(DataError):
         check_intrinsics(Intrinsics(Pinhole(*values), size), depth, "frame")
     good = Intrinsics(Pinhole(525, 525, 320, 240), (640, 480))
-    assert check_intrinsics(good, depth, "frame") == good.camera
+    assert check_intrinsics(good, depth, "frame") == ""
+    assert "crop" in check_intrinsics(Intrinsics(Pinhole(525, 525, 160, 240)), depth, "frame")
+    with pytest.raises(DataError, match="millimetres"):
+        check_intrinsics(good, depth * 1000, "frame")

@@ -13,12 +13,8 @@ from qs3.datasets.domain import Domain
 from qs3.datasets.importing import check_cloud, import_into
 from qs3.datasets.published import GraspNetPC, NamedArrays, PointDAH5, PublishedTree
 from qs3.errors import DataError
-from qs3.store.store import (
-    ManifestRow,
-    is_finished,
-    open_pointset,
-    write_pointset,
-)
+from qs3.store.meta import ManifestRow, is_finished
+from qs3.store.store import open_pointset, write_pointset
 from qs3.training.load import _objects_by_id
 from tests.datasets.test_domain import domain
 from tests.fixtures import published as fixtures

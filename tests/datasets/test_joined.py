@@ -9,9 +9,8 @@ import pytest
 from qs3.datasets.domain import Domain
 from qs3.datasets.joined import Joined
 from qs3.errors import DataError, MissingDataError
-from qs3.store.manifest import read_manifest
-from qs3.store.meta import MadeOf
-from qs3.store.store import ManifestRow, open_pointset, write_pointset
+from qs3.store.meta import MadeOf, ManifestRow, read_manifest
+from qs3.store.store import open_pointset, write_pointset
 from tests.fixtures.published import cloud
 
 CLASSES = ("bed", "chair")

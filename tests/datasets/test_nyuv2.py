@@ -7,7 +7,7 @@ import pytest
 
 from qs3.datasets import nyuv2 as reader
 from qs3.errors import ConfigError, Qs3Error
-from qs3.store.store import is_finished, read_manifest
+from qs3.store.meta import is_finished, read_manifest
 from tests.composing import compose_domain
 from tests.fixtures.frame_files import write_nyuv2
 

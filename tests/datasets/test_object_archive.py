@@ -8,7 +8,7 @@ import pytest
 from qs3.datamodules.domain import DomainData
 from qs3.datasets.domain import compose_domain
 from qs3.errors import ConfigError, DataError
-from qs3.store.store import is_finished, read_manifest
+from qs3.store.meta import is_finished, read_manifest
 from tests.fixtures.frame_files import write_archive
 
 FOUND = [

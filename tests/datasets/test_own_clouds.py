@@ -12,7 +12,8 @@ import pytest
 from qs3.datasets.clouds import CloudFolder
 from qs3.datasets.importing import import_into
 from qs3.errors import DataError
-from qs3.store.store import open_pointset, read_manifest
+from qs3.store.meta import read_manifest
+from qs3.store.store import open_pointset
 from tests.datasets.own_clouds import CLOUD, TWO, own, write
 
 

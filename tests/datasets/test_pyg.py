@@ -12,7 +12,8 @@ from torch_geometric.transforms import NormalizeScale, SamplePoints
 from qs3.datasets.domain import Domain
 from qs3.datasets.pyg import from_pyg, knn_graph, to_pyg
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.store.store import ManifestRow, write_pointset
+from qs3.store.meta import ManifestRow
+from qs3.store.store import write_pointset
 
 CLASSES = ("box", "cup", "pen")
 RNG = np.random.default_rng(0)

@@ -20,7 +20,8 @@ from qs3.datasets.published import PublishedTree
 from qs3.datasets.scannet import ScanNet
 from qs3.errors import DataError
 from qs3.report.datasets import distance_to_mesh
-from qs3.store.store import open_pointset, read_manifest
+from qs3.store.meta import read_manifest
+from qs3.store.store import open_pointset
 from tests.datasets.conftest import LOST
 from tests.datasets.rooms import write_lists, write_scene
 from tests.datasets.writing import ID_OF, write_zip

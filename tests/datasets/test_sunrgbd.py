@@ -8,7 +8,7 @@ import pytest
 
 from qs3.datasets.sunrgbd import millimetres
 from qs3.errors import Qs3Error
-from qs3.store.store import is_finished, read_manifest
+from qs3.store.meta import is_finished, read_manifest
 from tests.composing import compose_domain
 from tests.fixtures.frame_files import write_sunrgbd
 

@@ -18,8 +18,9 @@ from qs3.errors import ConfigError, DataError, MissingDataError, RenderError
 from qs3.generation.command import generate
 from qs3.generation.recipes import Cloud
 from qs3.generation.workers import Outcome, save_part
+from qs3.store.meta import read_manifest
 from qs3.store.parts import PartFiles
-from qs3.store.store import open_pointset, read_manifest
+from qs3.store.store import open_pointset
 from tests.generation.generating import ROOT, command, config, fingerprint
 
 

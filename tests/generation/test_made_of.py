@@ -11,7 +11,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.generation.command import generate
 from qs3.generation.made_of import made_of
 from qs3.generation.plan import planned
-from qs3.store.store import is_finished
+from qs3.store.meta import is_finished
 from tests.fixtures.published import write_xyz_tree
 from tests.generation.generating import QUICK, composed, config
 

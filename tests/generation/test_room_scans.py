@@ -24,7 +24,7 @@ from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import OnFurniture
 from qs3.report.datasets import surfaces_of
 from qs3.sensors.renderers.base import Scene
-from qs3.store.manifest import ManifestRow
+from qs3.store.meta import ManifestRow
 from qs3.utils.seeding import object_rng
 from tests.generation.generating import composed
 

@@ -8,7 +8,7 @@ import qs3
 from qs3.errors import ConfigError, DataError, MeshError
 from qs3.generation.command import generate
 from qs3.meshes.io import load_mesh
-from qs3.store.manifest import read_manifest
+from qs3.store.meta import read_manifest
 from qs3.store.store import open_pointset
 from tests.generation.generating import QUICK, config
 

@@ -16,7 +16,8 @@ from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
 from qs3.report import inspection
 from qs3.report.datasets import chosen, distance_to_mesh, open_named, part_of, surfaces_of
-from qs3.store.store import ManifestRow, write_pointset
+from qs3.store.meta import ManifestRow
+from qs3.store.store import write_pointset
 from qs3.utils.seeding import object_rng
 from tests.fixtures import published as fixtures
 from tests.report.made_runs import not_blank

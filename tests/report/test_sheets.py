@@ -3,7 +3,8 @@
 import numpy as np
 
 from qs3.report import sheets
-from qs3.store.store import ManifestRow, write_pointset
+from qs3.store.meta import ManifestRow
+from qs3.store.store import write_pointset
 from qs3.utils.pictures import save_png
 from tests.report.made_runs import not_blank
 

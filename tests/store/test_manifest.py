@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import DataError
-from qs3.store import store
-from qs3.store.manifest import number, read_manifest, to_csv
-from qs3.store.store import ManifestRow, open_pointset, write_pointset
+from qs3.store.meta import SPLITS, ManifestRow, number, read_manifest, to_csv
+from qs3.store.store import open_pointset, write_pointset
 from tests.store.test_store import CLASSES, make
 
 text = st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), min_size=1, max_size=9)
@@ -26,7 +25,7 @@ def test_any_manifest_round_trips(tmp_path_factory, data, n, p):
         ManifestRow(
             id=name,
             cls=data.draw(st.sampled_from(CLASSES)),
-            split=data.draw(st.sampled_from(store.SPLITS)),
+            split=data.draw(st.sampled_from(SPLITS)),
             seed=data.draw(st.none() | st.integers(0, 2**64)),
             origin=data.draw(text | st.sampled_from(["", 'a "b", c', "x;y"])),
             views=data.draw(st.none() | st.integers(1, 9)),
@@ -41,7 +40,7 @@ def test_any_manifest_round_trips(tmp_path_factory, data, n, p):
     made = write_pointset(
         folder, name="any", classes=CLASSES, arrays={"points": points}, rows=rows, meta={}
     )
-    found = store.read_manifest(folder, CLASSES)
+    found = read_manifest(folder, CLASSES)
     assert [dataclasses.replace(row, index=None) for row in found] == rows
     np.testing.assert_array_equal(made.points, points)
     shutil.rmtree(folder)
@@ -76,7 +75,7 @@ def test_what_is_not_a_manifest(tmp_path, text):
     make(tmp_path / "d")
     (tmp_path / "d" / "manifest.csv").write_text(text)
     with pytest.raises(DataError, match=r"manifest\.csv"):
-        store.read_manifest(tmp_path / "d", CLASSES)
+        read_manifest(tmp_path / "d", CLASSES)
 
 
 def rows(*more):

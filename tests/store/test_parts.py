@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import zipfile
 
 import numpy as np
 import pytest
@@ -14,47 +12,21 @@ from qs3.store.parts import PartFiles
 from tests.fixtures.harm import Harm
 
 
-def _zip(name: str, data: bytes) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(name, data)
-    return file.getvalue()
-
-
-def test_nothing_is_unpickled(tmp_path):
-    parts = PartFiles(tmp_path)
-    parts.begin({"a": 1})
-    parts.write("x", {"n": 1}, {"points": np.zeros(3)})
-    (path,) = tmp_path.rglob("x.npz")
-    with np.load(path, allow_pickle=False) as file:
-        harmful = {name: np.array(Harm(tmp_path / "harm"), dtype=object) for name in file.files}
-    np.savez(path, **harmful)
-    with pytest.raises(DataError):
-        parts.read("x")
-    assert not (tmp_path / "harm").exists()
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"PK",
-        _zip("points.npy", b""),
-        _zip("note.npy", b"\x93NUMPY\x01\x00\x06\x00((((((" + bytes(9)),
-        _zip("xote.npy", b"").replace(b"xote", b"\0ote"),
-        _zip("note.npy", b"\x93NUMPY"),
-    ],
-    ids=["empty", "cut", "no note", "a header of brackets", "a name of nothing", "a cut header"],
-)
-def test_a_damaged_part_is_named(content, tmp_path):
+@pytest.mark.parametrize("content", [b"", b"PK", b"PK\x05\x06" + bytes(18)])
+def test_a_damaged_part_is_named_and_nothing_is_unpickled(content, tmp_path):
     parts = PartFiles(tmp_path)
     parts.begin({"a": 1})
     parts.write("x", {"n": 1}, {"points": np.zeros(3)})
     assert parts.read("x")[0] == {"n": 1}
     (path,) = tmp_path.rglob("x.npz")
     path.write_bytes(content)
-    with pytest.raises(DataError):
+    with pytest.raises(DataError, match=r"x\.npz"):
         parts.read("x")
+    harmful = np.array(Harm(tmp_path / "harm"), dtype=object)
+    np.savez(path, note=harmful, points=harmful)
+    with pytest.raises(DataError, match=r"x\.npz"):
+        parts.read("x")
+    assert not (tmp_path / "harm").exists()
 
 
 BEGUN = {
@@ -87,30 +59,23 @@ def test_what_differs_is_named_by_its_key(tmp_path, change, keys):
     assert [key.removeprefix("settings.") for key in found] == keys
 
 
-@pytest.mark.parametrize("content", [None, b"{", b"\xff"])
+@pytest.mark.parametrize("content", [b"{", b"\xff"])
 def test_a_recipe_that_cannot_be_read_is_named(tmp_path, content):
-    parts = PartFiles(tmp_path)
-    assert not parts.have_recipe
-    if content is not None:
-        (tmp_path / "recipe.json").write_bytes(content)
-        assert parts.have_recipe
+    (tmp_path / "recipe.json").write_bytes(content)
     with pytest.raises(DataError):
-        parts.check({})
+        PartFiles(tmp_path).begin({})
 
 
 def test_a_node_knows_whether_it_sees_the_same_dataset(tmp_path):
     parts = PartFiles(tmp_path)
     with pytest.raises(DataError):
         parts.check_there("")
-    assert parts.are_there is False
     parts.begin(BEGUN)
-    assert parts.are_there is True
     digest = hashlib.sha256((tmp_path / "recipe.json").read_bytes()).hexdigest()
     assert parts.recipe_sha256() == digest
     parts.check_there(digest)
-    for other in ("0" * 64, "f" * 64):
-        with pytest.raises(DataError):
-            parts.check_there(other)
+    with pytest.raises(DataError):
+        parts.check_there("0" * 64)
 
 
 def test_arrays_are_read_when_they_are_asked_for(tmp_path):
@@ -132,7 +97,3 @@ def test_arrays_are_read_when_they_are_asked_for(tmp_path):
     (tmp_path / "parts" / "one.npz").write_bytes(data)
     with pytest.raises(DataError):
         dict(parts.open("one")[1])
-    harmful = np.array([object()], dtype=object)
-    np.savez(tmp_path / "parts" / "two.npz", note=harmful, allow_pickle=True)
-    with pytest.raises(DataError, match=r"two\.npz is damaged"):
-        parts.open("two")

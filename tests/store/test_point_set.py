@@ -7,28 +7,8 @@ import pytest
 
 from qs3.errors import DataError
 from qs3.store import store
-from qs3.store.meta import MadeOf
-from qs3.store.store import ManifestRow
+from qs3.store.meta import MadeOf, ManifestRow
 from tests.store.test_store import make
-
-
-def test_split_is_a_view_and_keeps_order(tmp_path):
-    data = make(tmp_path / "d")
-    test = data.split("test")
-    assert np.shares_memory(test.points, data.points)
-    assert test.ids == ("bed/4", "chair/5")
-    assert len(test) == 2
-    assert test.sha256 == data.sha256
-    assert data.indices("test").tolist() == [4, 5]
-    with pytest.raises(DataError):
-        data.split("validation")
-
-
-def test_split_of_scattered_rows(tmp_path):
-    rows = [ManifestRow(str(i), "bed", ("train", "test")[i % 2]) for i in range(4)]
-    points = np.arange(4)[:, None, None] + np.zeros((4, 2, 3))
-    data = make(tmp_path / "d", rows=rows, arrays={"points": points})
-    assert data.split("test").points[:, 0, 0].tolist() == [1, 3]
 
 
 def scattered(folder, labels="0120", splits="aaba"):
@@ -58,6 +38,9 @@ def test_any_split_holds_its_own_clouds_and_no_others(tmp_path, splits):
         assert part.labels.tolist() == [i % 3 for i in expected]
         adjacent = expected == list(range(expected[0], expected[-1] + 1))
         assert np.shares_memory(part.points, data.points) == adjacent
+        assert part.sha256 == data.sha256
+    with pytest.raises(DataError):
+        data.split("validation")
 
 
 def test_members_and_counts_of_each_class(tmp_path):

@@ -14,7 +14,8 @@ import torch
 from qs3.config import hashing
 from qs3.runs.metrics import RunMetrics
 from qs3.runs.predictions import pseudo_labels_path, read_predictions, read_pseudo_labels
-from qs3.store.store import ManifestRow, open_pointset, write_pointset
+from qs3.store.meta import ManifestRow
+from qs3.store.store import open_pointset, write_pointset
 from qs3.training.command import train
 from tests.training.toy import CLASSES, CONF, toy_config, write_toy
 

@@ -9,7 +9,8 @@ import pytest
 
 from qs3.datamodules.clouds import Clouds
 from qs3.errors import DataError
-from qs3.store.store import ManifestRow, open_pointset, write_pointset
+from qs3.store.meta import ManifestRow
+from qs3.store.store import open_pointset, write_pointset
 from qs3.training.command import train
 from qs3.training.load import check_real_sizes
 

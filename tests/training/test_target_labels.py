@@ -16,7 +16,8 @@ from qs3.datamodules.splits import RULES
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import Evaluation
 from qs3.evaluation.validators import STUDENT_RULES
-from qs3.store.store import ManifestRow, PointSet, open_pointset, write_pointset
+from qs3.store.meta import ManifestRow
+from qs3.store.store import PointSet, open_pointset, write_pointset
 from qs3.training.command import train
 from tests.training.search import Truth, search
 from tests.training.toy import _SHAPES, CLASSES, write_domain

@@ -10,7 +10,8 @@ import pytest
 
 from qs3.config import hashing
 from qs3.runs.metrics import read_metrics
-from qs3.store.store import ManifestRow, PointSet, open_pointset, write_pointset
+from qs3.store.meta import ManifestRow
+from qs3.store.store import PointSet, open_pointset, write_pointset
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES
 

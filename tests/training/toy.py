@@ -10,8 +10,8 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from qs3.store.meta import MadeOf
-from qs3.store.store import ManifestRow, write_pointset
+from qs3.store.meta import MadeOf, ManifestRow
+from qs3.store.store import write_pointset
 from tests.composing import compose
 
 CLASSES = ("ball", "rod", "slab")
