@@ -1,4 +1,4 @@
-"""A sensor before a square in front of a wall: shadows, and how far edges are blurred.
+"""A sensor and a square in front of a wall: shadows, and how far edges are blurred.
 
 Shadows are measured on who sees and who lights the wall, so they test geometry alone; blur is
 measured on the disparity map (the depth image of a sensor without one).
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.calibration.subject import POSE, SquareBeforeWall, Subject
+from qs3.calibration.subject import POSE, Subject, box_of, quad
 from qs3.sensors.renderers.base import Renderer
 
 _HALF_PX = 40  # half the square's side
@@ -26,12 +26,11 @@ def measure(
 ) -> dict[str, Any]:
     """Render and measure `frames` squares, each elsewhere by fractions of a pixel.
 
-    `depths_m` are those of square and wall; None: what the sensor reaches, with a shadow of 8 px or
-    more if possible.
+    `depths_m` are those of square and wall; None: what the sensor reaches.
 
     Returns:
         sensor, near_m, far_m; widths in px of the shadow of the other camera and of the projector,
-        `camera_left_px` and so on, beside `camera_expected_px`; of the square's open edge (right)
+        `camera_left_px` and so on, and `camera_expected_px`; of the square's open edge (right)
         `reaches_px`, by how much near depths reach beyond it, `wall_px`, where the wall's depth
         begins, and `half_window_px`.
     """
@@ -45,9 +44,14 @@ def measure(
     found: dict[str, list[np.ndarray]] = defaultdict(list)
     for i in range(frames):
         place = ((i + 0.5) / frames + 0.13, (0.37 * i) % 1)
-        bodies, box = SquareBeforeWall(near_m, far_m, _HALF_PX, place).scene(k.focal_px, around)
+        front = _facing(near_m, k.focal_px, _HALF_PX, place)
+        wall, around_wall = (
+            _facing(far_m, k.focal_px, _HALF_PX + n * around, place) for n in (3, 1)
+        )
         rng = np.random.default_rng([0, i])
-        frame = subject.sensor.scan(bodies, box, POSE, renderer, rng, explain=True)
+        frame = subject.sensor.scan(
+            (quad(front), quad(wall)), box_of(around_wall), POSE, renderer, rng, explain=True
+        )
         assert frame is not None, "the square is outside the view"
         clean, depth = frame.clean_m, frame.depth_m
         disparity = frame.images.get("disparity")
@@ -75,6 +79,16 @@ def measure(
     return out
 
 
+def _facing(
+    depth_m: float, focal_px: float, half_px: float, centre_px: tuple[float, float]
+) -> np.ndarray:
+    """[4, 3] corners of a square that faces the camera, with its size and place in pixels."""
+    (u, v), px = centre_px, depth_m / focal_px
+    x = np.array([u - half_px, u + half_px, u + half_px, u - half_px]) * px
+    y = np.array([v - half_px, v - half_px, v + half_px, v + half_px]) * px
+    return np.stack([x, y, np.full(4, depth_m)], axis=1)
+
+
 def _inner_rows(square: np.ndarray) -> np.ndarray:
     """Rows of the inner half of a square, of [h, w] bool."""
     rows = np.flatnonzero(square.any(axis=1))
@@ -86,27 +100,15 @@ def _shadow(clean: np.ndarray, dark: np.ndarray, middle_m: float) -> np.ndarray:
     square = clean < middle_m
     out = []
     for row in _inner_rows(square):
-        columns = np.flatnonzero(square[row])
-        sides = dark[row, : columns[0]][::-1], dark[row, columns[-1] + 1 :]
-        out.append([_first_run(side) for side in sides])
+        first, *_, last = np.flatnonzero(square[row])
+        out.append([dark[row, :first].sum(), dark[row, last + 1 :].sum()])
     return np.array(out, dtype=np.float64).reshape(-1, 2)
 
 
-def _first_run(dark: np.ndarray) -> int:
-    """Dark pixels from the first one on, before 5 in a row are bright."""
-    if not dark.any():
-        return 0
-    start = int(np.argmax(dark))
-    bright = np.convolve(~dark, _IN_A_ROW, mode="valid") == len(_IN_A_ROW)
-    ends = np.flatnonzero(bright[start:])
-    return int(dark[: start + int(ends[0]) if len(ends) else len(dark)].sum())
-
-
 def _open_edge(clean: np.ndarray, depth: np.ndarray, middle_m: float) -> np.ndarray:
-    """[rows, 2] across the right side of the square, NaN where there is none.
+    """[rows, 2] at the right side of the square, NaN where there are none.
 
-    px by which near depths reach beyond the true edge, positive outwards; px from the edge to the
-    first five pixels in a row that have the wall's depth.
+    px by which near depths reach beyond it; px to the first five in a row of the wall's depth.
     """
     square = clean < middle_m
     with np.errstate(invalid="ignore"):

@@ -33,8 +33,7 @@ _ERROR = 0.02  # by which statistics of pictures of other dots differ, relative
 def statistics(grey: torch.Tensor) -> torch.Tensor:
     """[1 + _LAGS] covariances of pixels 0, 1, 2, ... apart, over rows and columns.
 
-    Of [h, w] grey values relative to the local mean. Neighbours share texture alone, because noise
-    is each pixel's own; the first is texture and noise.
+    Of [h, w] grey values relative to the local mean. Neighbours share texture and no noise.
     """
     mean = blurred(grey, torch.tensor(_SMOOTH_PX, dtype=grey.dtype))
     frame = int(4 * _SMOOTH_PX)  # the shading is not known there
@@ -50,19 +49,17 @@ def statistics(grey: torch.Tensor) -> torch.Tensor:
 
 def fit_light(
     base: SpeckleStereo, lit: Sequence[np.ndarray], dark: Sequence[np.ndarray], distance_m: float
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Fit the numbers of `KEYS`.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values of `KEYS`, and relative standard errors by the curvature of the fit.
 
     Args:
         base: the preset to begin with; pattern, projector, geometry and electrons stay.
         lit, dark: [h, w] grey values 0..255 of a wall that faces the cameras, with the projector on
             and off at the same exposure, a picture a camera.
         distance_m: of the wall.
-
-    Returns:
-        Values, and relative standard errors by the curvature of the fit.
     """
-    wanted = _mean(lit, dark)
+    pairs = [[torch.from_numpy(image) for image in pair] for pair in zip(lit, dark, strict=True)]
+    wanted = torch.stack([_compared(*pair) for pair in pairs]).mean(dim=0)
     twin = Twin(_facing(base, distance_m), fine=3)
     start = settings_of(twin.pair, 1.0)
     camera, zero = base.infrared, torch.zeros((), dtype=torch.float64)
@@ -82,22 +79,16 @@ def fit_light(
         off = exposed(even, settings, noise, False, apart, camera.max_exposure)
         return (_compared(on, off) / wanted - 1) / _ERROR
 
-    def slopes(logs: np.ndarray) -> np.ndarray:
-        found = torch.autograd.functional.jacobian(residuals, torch.from_numpy(logs))
-        return np.asarray(found)
-
+    jacobian = torch.autograd.functional.jacobian
     solved = least_squares(
-        lambda logs: residuals(torch.from_numpy(logs)).detach().numpy(),
+        lambda logs: residuals(torch.from_numpy(logs)).numpy(),
         np.zeros(len(KEYS)),
-        jac=slopes,
+        jac=lambda logs: jacobian(residuals, torch.from_numpy(logs)).numpy(),
         bounds=(-4, 4),
         x_scale=0.5,
     )
     values = np.array(first) * np.exp(solved.x)
-    errors = np.sqrt(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)))
-    return dict(zip(KEYS, values.tolist(), strict=True)), dict(
-        zip(KEYS, errors.tolist(), strict=True)
-    )
+    return values, np.sqrt(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)))
 
 
 def _compared(on: torch.Tensor, off: torch.Tensor) -> torch.Tensor:
@@ -106,23 +97,13 @@ def _compared(on: torch.Tensor, off: torch.Tensor) -> torch.Tensor:
     return torch.cat([light, statistics(on), statistics(off)[:1]])
 
 
-def _mean(lit: Sequence[np.ndarray], dark: Sequence[np.ndarray]) -> torch.Tensor:
-    each = [
-        _compared(*(torch.from_numpy(image.astype(np.float64)) for image in pair))
-        for pair in zip(lit, dark, strict=True)
-    ]
-    return torch.stack(each).mean(dim=0)
-
-
 def _facing(base: SpeckleStereo, distance_m: float) -> Pair:
     """A white plane that faces the cameras, a square of pixels in the middle of the view."""
-    k = base.intrinsics
-    high, wide = min(_SIDE_PX, k.height_px), min(_SIDE_PX, k.width_px)
-    window = Window((k.width_px - wide) // 2, (k.height_px - high) // 2, wide, high)
-    one = torch.ones(high, wide, dtype=torch.float64)
-    plane = torch.zeros(high, wide, 3, dtype=torch.float64)
-    plane[..., 2] = 1 / distance_m
-    view = View(window, plane, one, one, one > 0, one * distance_m)
+    k, side = base.intrinsics, _SIDE_PX
+    window = Window((k.width_px - side) // 2, (k.height_px - side) // 2, side, side)
+    one = torch.ones(side, side, dtype=torch.float64)
+    plane = torch.stack([0 * one, 0 * one, one / distance_m], dim=-1)
+    view = View(window, plane, one, one, one > 0)
     return Pair(base, view, view)
 
 
@@ -140,7 +121,10 @@ def fit_pictures(folder: Path, base: str, distance_m: float) -> str:
     lit = [_grey(folder / f"{side}.png") for side in sides]
     dark = [_grey(folder / f"{side}_off.png") for side in sides]
     values, errors = fit_light(sensor, lit, dark, distance_m)
-    lines = [f"{key.split('.')[-1]}: {values[key]:.6g}  # +- {errors[key]:.1%}" for key in KEYS]
+    lines = [
+        f"{key.split('.')[-1]}: {value:.6g}  # +- {error:.1%}"
+        for key, value, error in zip(KEYS, values, errors, strict=True)
+    ]
     return f"""\
 # Fitted to infrared pictures of a wall at {distance_m:g} m.
 defaults:

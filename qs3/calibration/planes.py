@@ -1,4 +1,4 @@
-"""A sensor before planes of known depth and tilt: one row of numbers a condition.
+"""A sensor in front of planes of known depth and tilt: one row of numbers a condition.
 
 What is measured is defined as in librealsense's depth-quality tool
 (tools/depth-quality/rs-depth-quality.cpp): fill rate is the share of valid pixels in the region
@@ -8,136 +8,168 @@ RMS is that of f B / Z - f B / Z_plane, and Z accuracy the median of the signed 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from qs3.calibration.subject import ALBEDO, POSE, Subject, TiltedPlane
+from qs3.calibration.subject import ALBEDO, POSE, Subject, box_of, quad
+from qs3.geometry.cameras import Intrinsics, Window
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.devices.fitted import FittedDepth
-from qs3.sensors.renderers.base import Renderer
+from qs3.sensors.renderers.base import Body, Renderer
 
-TRIM = 0.005
+_TRIM = 0.005
 _GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
-class PlanarCondition:
-    """Planes around one depth, at one tilt.
+class TiltedPlane:
+    """A plane through a point of a pixel's ray, turned away from that ray.
 
     Attributes:
-        depth_m: in the middle of the depths of this condition.
-        tilt_deg: angle of incidence, 0..85; both signs of it are pooled.
-        along: the plane recedes along the baseline, else across it.
-        phases: how many planes; their disparities are spread over one whole pixel, so that
-            every sub-pixel place of a match counts alike.
-        half_px: half the side of the region that is measured, in samples of the depth image.
+        depth_m: along the optical axis, at the centre of the region.
+        tilt_deg: angle of incidence there; its sign is the side to which the plane recedes.
+        along: the plane recedes along the rows of the image (along the baseline); else along
+            the columns.
+        centre_px: (u, v) of the region's centre, relative to the principal point.
     """
 
     depth_m: float
     tilt_deg: float = 0.0
     along: bool = True
-    phases: int = 16
-    half_px: int = 24
+    centre_px: tuple[float, float] = (0.0, 0.0)
 
-    def depths_m(self, focal_baseline: float | None) -> np.ndarray:
-        """[phases] depths: whole disparity pixels for a sensor that triangulates.
+    def inverse(self, focal_px: float) -> np.ndarray:
+        """[3] (a, b, c) of 1 / Z = a x + b y + c, with x, y the tangents of a ray."""
+        ray = np.array([self.centre_px[0] / focal_px, self.centre_px[1] / focal_px, 1.0])
+        unit = ray / np.linalg.norm(ray)
+        slope = np.array([1.0, 0, 0]) if self.along else np.array([0, 1.0, 0])
+        slope -= (slope @ unit) * unit
+        slope /= np.linalg.norm(slope)
+        angle = np.deg2rad(self.tilt_deg)
+        normal = np.cos(angle) * unit - np.sin(angle) * slope
+        return normal / (normal @ ray * self.depth_m)
 
-        Evenly spread with a shift of the golden ratio within each slot, so that they fall on
-        every place within the steps of a quantiser, too. Others get +-2 % of the depth.
-        """
-        k = np.arange(self.phases)
-        place = (k + (k * _GOLDEN) % 1) / self.phases - 0.5  # -0.5 .. 0.5
-        if focal_baseline is None:
-            return self.depth_m * (1 + 0.04 * place)
-        return focal_baseline / (focal_baseline / self.depth_m + place)
+    def depth_at(self, u: np.ndarray, v: np.ndarray, focal_px: float) -> np.ndarray:
+        """Depth at pixels relative to the principal point; not positive beyond the horizon."""
+        a, b, c = self.inverse(focal_px)
+        return 1 / (a * u / focal_px + b * v / focal_px + c)
+
+    def region(self, k: Intrinsics, half_px: int, step_px: int = 1) -> Window:
+        """The pixels to measure on: fewer where the depth would change much across them."""
+        steep = abs(np.tan(np.deg2rad(self.tilt_deg)))
+        flat = half_px if steep == 0 else min(half_px, int(0.12 * k.focal_px / steep))
+        flat = max(flat, 2 * step_px + 1)
+        wide, high = (flat, half_px) if self.along else (half_px, flat)
+        u = round(k.cx_px + self.centre_px[0])
+        v = round(k.cy_px + self.centre_px[1])
+        return Window(u - wide, v - high, 2 * wide + 1, 2 * high + 1)
+
+    def scene(
+        self, k: Intrinsics, region: Window, margin_px: int
+    ) -> tuple[tuple[Body, ...], np.ndarray]:
+        """The plane, three margins wider than `region`, and the [2, 3] box of one margin."""
+        body = quad(self._corners(k, region, 3 * margin_px))
+        return (body,), box_of(self._corners(k, region, margin_px))
+
+    def _corners(self, k: Intrinsics, region: Window, margin_px: int) -> np.ndarray:
+        """[4, 3] where the rays through the corners of a grown region meet the plane."""
+        low_u, low_v = region.left - margin_px - k.cx_px, region.top - margin_px - k.cy_px
+        high_u = low_u + region.width - 1 + 2 * margin_px
+        high_v = low_v + region.height - 1 + 2 * margin_px
+        # Not so far out that the plane comes near its horizon or the camera.
+        a, b, _ = self.inverse(k.focal_px) * self.depth_m
+        slope, centre = (a, self.centre_px[0]) if self.along else (b, self.centre_px[1])
+        if slope:
+            reach = 0.7 * k.focal_px / abs(slope)
+            if self.along:
+                low_u, high_u = max(low_u, centre - reach), min(high_u, centre + reach)
+            else:
+                low_v, high_v = max(low_v, centre - reach), min(high_v, centre + reach)
+        u = np.array([low_u, high_u, high_u, low_u])
+        v = np.array([low_v, low_v, high_v, high_v])
+        z = self.depth_at(u, v, k.focal_px)
+        return np.stack([u / k.focal_px * z, v / k.focal_px * z, z], axis=1)
 
 
-@dataclass(frozen=True)
-class _Part:
-    """One frame: [N] errors and disparities, the RMS beside its own plane, the stated noise.
+def phases_m(depth_m: float, count: int, focal_baseline: float | None) -> np.ndarray:
+    """[count] depths around one, over a whole pixel of disparity; else over +-2 % of the depth.
 
-    `residual` [h, w] is the disparity less that of the fitted plane, NaN where there is none.
+    Evenly spread with a shift of the golden ratio within each slot, so that they fall on every
+    place within the steps of a quantiser, too.
     """
-
-    error_m: np.ndarray
-    error_px: np.ndarray
-    disparity: np.ndarray
-    plane_rms_m: float
-    subpixel_rms_px: float
-    residual: np.ndarray
-    wanted: int
-    law_m: float
+    k = np.arange(count)
+    place = (k + (k * _GOLDEN) % 1) / count - 0.5  # -0.5 .. 0.5
+    if focal_baseline is None:
+        return depth_m * (1 + 0.04 * place)
+    return focal_baseline / (focal_baseline / depth_m + place)
 
 
 def measure(
-    subject: Subject, condition: PlanarCondition, renderer: Renderer, seed: int = 0
+    subject: Subject,
+    renderer: Renderer,
+    depth_m: float,
+    tilt_deg: float = 0.0,
+    along: bool = True,
+    phases: int = 16,
+    half_px: int = 24,
 ) -> dict[str, Any]:
-    """Render and measure one condition; the same call gives the same numbers.
+    """Render and measure planes around one depth, at one tilt.
+
+    Args:
+        subject, renderer: what is tested, and what makes its images.
+        depth_m: in the middle of the depths of the planes.
+        tilt_deg: angle of incidence, 0..85; both signs of it are pooled.
+        along: the planes recede along the baseline, else across it.
+        phases: how many planes; their disparities are spread over one whole pixel, so that
+            every sub-pixel place of a match counts alike.
+        half_px: half the side of the region that is measured, in samples of the depth image.
 
     Returns:
-        sensor, depth_m, tilt_deg, recedes ("", "along" or "across" the baseline), and the numbers,
-        NaN where there is no such thing:
+        sensor, depth_m, tilt_deg, recedes ("", "along" or "across" the baseline), and the numbers:
         pixels: of the region, over all planes.
         fill: share of them that is valid.
         sigma_m, bias_m: standard deviation and median of depth minus true depth over all planes,
             the former without the outer 2 x 0.5 %.
         accuracy: bias over depth.
-        plane_rms_m, subpixel_rms_px: about the plane fitted to each image.
-        sigma_px, bias_px: as sigma_m and bias_m, of the disparity.
-        outliers: share of disparities that are off by more than 1 px.
+        subpixel_rms_px: of the disparity about the plane fitted to each image.
+        bias_px: as bias_m, of the disparity.
         correlation_px: over how many pixels noise is shared, see `correlation_px`.
-        levels, levels_expected: distinct depths between the nearest and the farthest plane.
         law_m: noise that the sensor states itself.
     """
-    parts, fb = [], subject.focal_baseline
-    depths = condition.depths_m(fb)
-    for k, depth in enumerate(depths):
+    found: dict[str, list[Any]] = defaultdict(list)
+    fb, facing = subject.focal_baseline, tilt_deg == 0
+    for k, depth in enumerate(phases_m(depth_m, phases, fb)):
         # Elsewhere in the image for each plane: other dots of the pattern.
         angle, away = 2 * np.pi * _GOLDEN * k, 12.0 + 24.0 * (k % 4) / 4
         centre = (away * np.cos(angle) * subject.step_px, away * np.sin(angle) * subject.step_px)
-        sign = 1 if k % 2 else -1
-        plane = TiltedPlane(float(depth), sign * condition.tilt_deg, condition.along, centre)
-        rng = np.random.default_rng([seed, k])
-        parts.append(_part(subject, plane, *take(subject, plane, condition.half_px, renderer, rng)))
-    facing = condition.tilt_deg == 0
-    error = np.concatenate([part.error_m for part in parts])
-    wanted = sum(part.wanted for part in parts)
+        plane = TiltedPlane(float(depth), tilt_deg if k % 2 else -tilt_deg, along, centre)
+        frame, part = take(subject, plane, half_px, renderer, np.random.default_rng([0, k]))
+        for key, value in _measured(frame, part, fb).items():
+            found[key].append(value)
+        found["law_m"].append(stated_sigma_m(subject.sensor, plane.depth_m, frame))
+    error, wanted = np.concatenate(found["error_m"]), sum(found["pixels"])
     out: dict[str, Any] = {
         "sensor": subject.name,
-        "depth_m": condition.depth_m,
-        "tilt_deg": float(condition.tilt_deg),
-        "recedes": "" if facing else "along" if condition.along else "across",
+        "depth_m": depth_m,
+        "tilt_deg": float(tilt_deg),
+        "recedes": "" if facing else "along" if along else "across",
         "pixels": wanted,
         "fill": len(error) / wanted,
         "sigma_m": _spread(error),
         "bias_m": _median(error),
-        "accuracy": _median(error) / condition.depth_m,
-        "plane_rms_m": _pooled([part.plane_rms_m for part in parts]),
-        "law_m": _pooled([part.law_m for part in parts]) if facing else np.nan,
+        "accuracy": _median(error) / depth_m,
+        "law_m": _rms(np.array(found["law_m"])) if facing else np.nan,
     }
     if fb is None:
         return out
-    error_px = np.concatenate([part.error_px for part in parts])
-    out |= {
-        "subpixel_rms_px": _pooled([part.subpixel_rms_px for part in parts]),
-        "sigma_px": _spread(error_px),
-        "bias_px": _median(error_px),
-        "outliers": float(np.mean(np.abs(error_px) > 1)) if error_px.size else np.nan,
-    }
+    out["subpixel_rms_px"] = _rms(np.array(found["rms_px"]))
+    out["bias_px"] = _median(np.concatenate(found["error_px"]))
     if facing:
-        residuals = [part.residual for part in parts]
-        out["correlation_px"] = correlation_px(residuals) * subject.step_px
-    if subject.steps_per_px:
-        low, high = float((fb / depths).min()), float((fb / depths).max())
-        found = np.concatenate([part.disparity for part in parts])
-        found = found[(found >= low) & (found <= high)]
-        out["levels"] = len(np.unique(np.rint(found * 1024)))
-        out["levels_expected"] = expected_levels(
-            low, high, subject.steps_per_px, subject.level_offset_px
-        )
+        out["correlation_px"] = correlation_px(found["residual"]) * subject.step_px
     return out
 
 
@@ -165,38 +197,36 @@ def _samples(start: int, length: int, first: int, step: int) -> slice:
     return slice(low, (start + length - 1 - first) // step + 1)
 
 
-def _part(
-    subject: Subject, plane: TiltedPlane, frame: DepthFrame, part: tuple[slice, slice]
-) -> _Part:
+def _measured(frame: DepthFrame, part: tuple[slice, slice], fb: float | None) -> dict[str, Any]:
+    """Of one frame: [N] errors; [h, w] residuals from the fitted plane with NaN."""
     depth, clean = (a[part].astype(np.float64) for a in (frame.depth_m, frame.clean_m))
     wanted = np.isfinite(clean)
     valid = wanted & np.isfinite(depth)
+    z, truth = depth[valid], clean[valid]
+    out = {"error_m": z - truth, "pixels": int(wanted.sum())}
+    if fb is None:
+        return out
     rows, cols = np.nonzero(valid)
-    k, fb = frame.camera.intrinsics, subject.focal_baseline
+    k = frame.camera.intrinsics
     x = (frame.left + (cols + part[1].start) * frame.step_px - k.cx_px) / k.focal_px
     y = (frame.top + (rows + part[0].start) * frame.step_px - k.cy_px) / k.focal_px
-    z, truth = depth[valid], clean[valid]
     residual = np.full(depth.shape, np.nan)
-    rms_m, inverse = fit_plane(z, x, y)
-    if fb is not None:
-        residual[valid] = fb / z - fb * (inverse @ np.stack([x, y, np.ones_like(x)]))
-    order = np.argsort(z, kind="stable")
-    cut = int(len(order) * TRIM)
-    inner = residual[valid][order[cut : len(order) - cut]]
-    nothing = np.zeros(0)
-    return _Part(
-        error_m=z - truth,
-        error_px=nothing if fb is None else fb / z - fb / truth,
-        disparity=nothing if fb is None else fb / z,
-        plane_rms_m=rms_m,
-        subpixel_rms_px=_rms(inner),
-        residual=residual,
-        wanted=int(wanted.sum()),
-        law_m=stated_sigma_m(subject.sensor, plane.depth_m, frame),
-    )
+    residual[valid] = fb / z - fb * (fit_plane(z, x, y) @ np.stack([x, y, np.ones_like(x)]))
+    return out | {
+        "error_px": fb / z - fb / truth,
+        "rms_px": _rms(residual[valid][_inner(z)]),
+        "residual": residual,
+    }
 
 
-def fit_plane(depth_m: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+def _inner(depth_m: np.ndarray) -> np.ndarray:
+    """Indices of [N] depths without the nearest and farthest 0.5 %."""
+    order = np.argsort(depth_m, kind="stable")
+    cut = int(len(order) * _TRIM)
+    return order[cut : len(order) - cut]
+
+
+def fit_plane(depth_m: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Total least squares through [N] points, without the nearest and farthest 0.5 %.
 
     Args:
@@ -204,29 +234,23 @@ def fit_plane(depth_m: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[float,
         x, y: tangents of the rays, (u - cx) / f and (v - cy) / f.
 
     Returns:
-        RMS of the distances to the plane, and [3] (a, b, c) of 1 / Z = a x + b y + c; NaN for
-        fewer than 10 points.
+        [3] (a, b, c) of 1 / Z = a x + b y + c; NaN for fewer than 10 points.
     """
     if len(depth_m) < 10:
-        return np.nan, np.full(3, np.nan)
-    order = np.argsort(depth_m, kind="stable")
-    cut = int(len(order) * TRIM)
-    keep = order[cut : len(order) - cut]
+        return np.full(3, np.nan)
+    keep = _inner(depth_m)
     z, x, y = (np.asarray(a, dtype=np.float64)[keep] for a in (depth_m, x, y))
     points = np.stack([x * z, y * z, z], axis=1)
     centre = points.mean(axis=0)
     normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
     # n . (x, y, 1) Z = n . centre, so 1 / Z is linear in x and y.
-    return _rms((points - centre) @ normal), normal / (normal @ centre)
+    return normal / (normal @ centre)
 
 
 def stated_sigma_m(sensor: Any, depth_m: float, frame: DepthFrame) -> float:
     """Standard deviation of the depth of a plane that faces the sensor, by the sensor's own law.
 
-    Args:
-        sensor: any; those that state no law give NaN.
-        depth_m: of the plane, whose albedo is ALBEDO.
-        frame: of that plane, for exposures that no one knows beforehand.
+    `frame` is of that plane, for exposures that are not known beforehand. NaN if there is no law.
     """
     if isinstance(sensor, FittedDepth):  # its law is that before the quantiser
         steps = (sensor.inverse_step_per_m * depth_m**2, sensor.depth_step_m)
@@ -247,8 +271,9 @@ def stated_sigma_m(sensor: Any, depth_m: float, frame: DepthFrame) -> float:
 
 
 def _rms(values: np.ndarray) -> float:
-    """Root of the mean square; NaN of nothing."""
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else np.nan
+    """Root of the mean square of what is finite; NaN of nothing."""
+    good = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.square(good)))) if good.size else np.nan
 
 
 def _median(values: np.ndarray) -> float:
@@ -258,22 +283,9 @@ def _median(values: np.ndarray) -> float:
 def _spread(values: np.ndarray) -> float:
     """Standard deviation without the lowest and the highest 0.5 %; NaN of nothing."""
     values = np.sort(values[np.isfinite(values)], axis=None)
-    cut = int(len(values) * TRIM)
+    cut = int(len(values) * _TRIM)
     kept = values[cut : len(values) - cut]
     return float(np.std(kept)) if kept.size else np.nan
-
-
-def _pooled(values: Sequence[float]) -> float:
-    """Root of the mean of the squares of each frame's."""
-    found = np.array(values)
-    return _rms(found[np.isfinite(found)])
-
-
-def expected_levels(low_px: float, high_px: float, steps_per_px: int, offset_px: float) -> int:
-    """How many steps k / steps_per_px + offset_px lie in [low_px, high_px]."""
-    first = np.ceil((low_px - offset_px) * steps_per_px - 1e-6)
-    last = np.floor((high_px - offset_px) * steps_per_px + 1e-6)
-    return int(max(0, last - first + 1))
 
 
 def correlation_px(residuals: Sequence[np.ndarray]) -> float:

@@ -16,7 +16,6 @@ from scipy.optimize import nnls
 from qs3.errors import DataError
 from qs3.geometry.cameras import Intrinsics
 
-_TRIES = 300
 _WIDE = 0.02  # of 1 / Z, relative: what the first fit takes for the wall
 _LEAST_PIXELS = 2000
 _LEAST_PURE = 0.6  # share of the depths within the outline of the wall that lie on it
@@ -55,14 +54,12 @@ class Wall:
     fill: float
 
 
-def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0) -> Wall:
+def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics) -> Wall:
     """Fit the plane that most pixels of `depth_m` [h, w] with NaN lie on.
 
     Random triples first (the one with the lowest 30 % quantile of errors), then least squares on
-    what lies within 4.5 standard deviations, eight times.
-
-    Raises:
-        DataError: no plane covers most of what it surrounds; the message begins with `name`.
+    what lies within 4.5 standard deviations, eight times. No plane that covers most of what it
+    surrounds is a DataError.
     """
     seen = np.isfinite(depth_m)
     rows, cols = np.nonzero(seen)
@@ -72,7 +69,7 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
     y = (rows - camera.cy_px) / camera.focal_px
     design = np.stack([np.ones_like(x), x, y], axis=1)
     inverse = 1 / depth_m[rows, cols]
-    normal = _plane_of_three(design, inverse, np.random.default_rng(seed))
+    normal = _plane_of_three(design, inverse, np.random.default_rng(0))
     near = np.abs(design @ normal - inverse) < _WIDE * inverse
     for _ in range(8):
         if near.sum() < _LEAST_PIXELS:
@@ -93,7 +90,8 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
     measured = np.where(on_wall, depth_m, np.nan)
     plane, tilt = _view(normal, camera, depth_m.shape)
     error_per_m = 1 / measured
-    basis = _cubic(rows[near] / depth_m.shape[0] - 0.5, cols[near] / depth_m.shape[1] - 0.5)
+    v, u = rows[near] / depth_m.shape[0] - 0.5, cols[near] / depth_m.shape[1] - 0.5
+    basis = np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
     bent = np.linalg.lstsq(basis, inverse[near], rcond=None)[0]
     error_per_m[rows[near], cols[near]] -= basis @ bent
     # The mean of 1 / Z is that of a depth a little smaller than the mean.
@@ -108,7 +106,7 @@ def _plane_of_three(
     """The plane through three random pixels that most others are near, of many tries."""
     few = rng.choice(len(inverse), min(len(inverse), 4000), replace=False)
     best, normal = np.inf, np.array([float(np.median(inverse)), 0.0, 0.0])
-    for _ in range(_TRIES):
+    for _ in range(300):
         triple = rng.choice(few, 3, replace=False)
         if abs(np.linalg.det(design[triple])) < 1e-6:
             continue
@@ -141,14 +139,9 @@ def _view(
     return plane, np.degrees(np.arccos(np.clip(cosine, 0, 1)))
 
 
-def _cubic(v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """[N, 10] monomials up to the third degree."""
-    return np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
-
-
 @dataclass(frozen=True)
 class Steps:
-    """Steps in which depths come: of Z in metres and of 1 / Z in 1/m; 0 where there are none."""
+    """Steps of Z in metres and of 1 / Z in 1/m; 0 where there are none."""
 
     depth_m: float = 0.0
     inverse_per_m: float = 0.0
@@ -183,15 +176,11 @@ def _resolution(depth_m: np.ndarray) -> float:
 
 
 def _lattice(x: np.ndarray, weight: np.ndarray, blur: np.ndarray) -> float:
-    """Step of the lattice that levels of 1 / Z lie on; 0 if there is none.
+    """Step of the lattice that levels `x` [N] of 1 / Z lie on; 0 if there is none.
 
     At the right step the phases of all levels are the same: the largest resultant wins, and of
-    those nearly as large the coarsest step, because every fraction of it fits, too.
-
-    Args:
-        x: [N] levels.
-        weight: [N] how much each counts.
-        blur: [N] width of the interval in which rounding in the file moves each.
+    those nearly as large the coarsest step, because every fraction of it fits, too. `blur` [N] is
+    the width of the interval in which rounding in the file moves each level.
     """
     if len(x) > _MAX_LEVELS:
         keep = np.linspace(0, len(x) - 1, _MAX_LEVELS).astype(int)
@@ -235,10 +224,9 @@ def _resultant(x: np.ndarray, weight: np.ndarray, blur: np.ndarray, frequency: f
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """sigma(Z) = floor_m + factor Z^power before the quantiser.
+    """The law sigma(Z) = floor_m + factor Z^power before the quantiser.
 
     Attributes:
-        floor_m, factor, power: of the law.
         correlation_px: standard deviation of the Gaussian that smooths the noise.
         depth_m, sigma_m: [n] what was measured, without what rounding adds.
     """
@@ -250,19 +238,11 @@ class Noise:
     depth_m: np.ndarray
     sigma_m: np.ndarray
 
-    def law_m(self, depth_m: np.ndarray) -> np.ndarray:
-        """sigma(Z)."""
-        return self.floor_m + self.factor * depth_m**self.power
 
-
-def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) -> Noise:
+def find_noise(walls: Sequence[Wall], steps: Steps) -> Noise:
     """Noise against distance, from the inner 99 % of the errors in bins of distance.
 
-    `power` 1 or 2 fixes the law; None takes what fits better, or 2 where all walls are about
-    equally far.
-
-    Raises:
-        DataError: no wall has enough pixels, or rounding hides the noise of all.
+    Its power is 1 or 2, what fits better; 2 where all walls are about equally far.
     """
     bins = []
     for wall in walls:
@@ -278,15 +258,11 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     if not bins:
         raise DataError("no noise is seen beside the steps of depth; turn the camera a little")
     z, sigma, weight = np.array(bins).T
-    powers = (1.0, 2.0) if power is None else (power,)
-    if z.max() / z.min() < _LEAST_RANGE:
-        floor, factor = 0.0, float(np.average(sigma / z**2, weights=weight))
-        return Noise(floor, factor, 2.0, _correlation_px(walls, steps), z, sigma)
-    laws = []
-    for each in powers:
+    several, laws = z.max() / z.min() >= _LEAST_RANGE, []
+    for each in (1.0, 2.0) if several else (2.0,):
         # Relative least squares with floor and factor >= 0.
-        design = np.stack([np.ones_like(z), z**each], axis=1) * (weight / sigma)[:, None]
-        (floor, factor), misfit = nnls(design, weight)
+        design = np.stack([several * np.ones_like(z), z**each], axis=1)
+        (floor, factor), misfit = nnls(design * (weight / sigma)[:, None], weight)
         laws.append((misfit, float(floor), float(factor), each))
     return Noise(*min(laws)[1:], _correlation_px(walls, steps), z, sigma)
 
@@ -299,10 +275,9 @@ def _inner_variance(values: np.ndarray) -> float:
 
 
 def _correlation_px(walls: Sequence[Wall], steps: Steps) -> float:
-    """Size s of the Gaussian that smooths the noise.
+    """Standard deviation s of the Gaussian that smooths the noise.
 
-    Pixels n apart have the correlation exp(-n^2 / 4 s^2); the covariances at n = 1 and 2 are free
-    of what rounding adds, which is each pixel's own.
+    Pixels n apart have the correlation exp(-n^2 / 4 s^2); at n = 1 and 2 rounding adds nothing.
     """
     near = far = variance = 0.0
     for wall in walls:

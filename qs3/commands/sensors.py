@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from annotated_types import Ge, Gt
 
@@ -38,16 +38,12 @@ def bench(
 def fit(
     *frames: Annotated[str, "depth images of a wall, .png of 16 bits or .npy"],
     out: Annotated[Path, "the preset, conf/sensor/NAME.yaml"],
-    plot: Annotated[Path | None, "the picture of data and law, .png (default: next to out)"] = None,
     intrinsics: Annotated[str | None, "fx,fy,cx,cy in px, or a file that has them"] = None,
     focal: Annotated[float | None, Gt(0), "px, in place of intrinsics=; centred"] = None,
     unit: Annotated[str | None, "m, mm or units a metre (default: mm of whole numbers)"] = None,
     distances: Annotated[tuple[float, ...], "true ones of each frame's middle, m: the bias"] = (),
     baseline: Annotated[
         float | None, "m from camera to projector, negative to the left: for the shadows"
-    ] = None,
-    power: Annotated[
-        Literal["1", "2"] | None, "noise grows with Z to this power (default: what fits better)"
     ] = None,
     images: Annotated[Path | None, "a folder of infrared pictures, in place of frames"] = None,
     base: Annotated[str, "stereo preset that images= begins with"] = "realsense_d415",
@@ -78,11 +74,10 @@ def fit(
             raise ConfigError("images= takes distance=METRES, and another name for out= than base=")
         text = fit_pictures(images, base, distance)
     else:
-        from qs3.calibration.fit import fit_walls
+        from qs3.calibration.fit import fit_walls, plot_noise
 
-        files, number = [Path(frame) for frame in frames], None if power is None else float(power)
-        preset = fit_walls(files, intrinsics, focal, unit, distances, baseline, number)
-        text = preset.text()
-        preset.plot(plot or out.with_suffix(".png"))
+        files = [Path(frame) for frame in frames]
+        text, noise = fit_walls(files, intrinsics, focal, unit, distances, baseline)
+        plot_noise(noise, out.with_suffix(".png"))
     write_text(out, text)
     print(f"{text}\nwrote {out}")

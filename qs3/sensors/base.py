@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,12 +20,9 @@ from qs3.utils.settings import Count, Positive, settings
 class DepthFrame:
     """One depth image of a part of a scene, on a regular grid of pixels.
 
-    Sample (r, c) is the pixel (u, v) = (left + c * step_px, top + r * step_px) of `camera`, really
-    measured, so no shift enters.
-
     Attributes:
         camera: where it was taken from.
-        left, top: pixel of the first sample.
+        left, top: pixel of the first sample; (r, c) is pixel (left + c step_px, top + r step_px).
         step_px: spacing of the samples in pixels of the camera.
         depth_m: [h, w] float32 as measured, NaN where nothing was.
         clean_m: [h, w] float32 true depth at the same pixels, inf where nothing is hit.
@@ -33,10 +30,8 @@ class DepthFrame:
         cosine: [h, w] float32 of the angle of incidence, 0 where nothing is.
         reason: [h, w] uint8 `Reason`. Shadow and occlusion are told apart from other causes only
             if the scan was asked to `explain`.
-        images: intermediate pictures by name ("left", "right", "disparity", ...), for looking at,
-            of the size of the rendered window.
-        true_lens: the intrinsics with which it was taken, where those of `camera` are what the
-            device believes; None: they are the same.
+        images: intermediate pictures by name ("left", "right", "disparity", ...), of the size of
+            the rendered window.
     """
 
     camera: Camera
@@ -49,21 +44,15 @@ class DepthFrame:
     cosine: np.ndarray
     reason: np.ndarray
     images: dict[str, np.ndarray] = field(default_factory=dict)
-    true_lens: Intrinsics | None = None
 
-    def points(
-        self, depth_m: np.ndarray, world_from_camera: np.ndarray, lens: Intrinsics | None = None
-    ) -> np.ndarray:
-        """Back-project `depth_m` [h, w] (self.depth_m or self.clean_m, possibly masked).
+    def points(self, depth_m: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
+        """Back-project `depth_m` [h, w] to [M, 3] float64 points in the world, row by row.
 
-        `world_from_camera` [4, 4] is the pose that is believed: a drifting one or the true.
-        Likewise `lens`; None: the one that the device believes.
-
-        Returns:
-            [M, 3] float64 points in the world, row-major, of the pixels that are finite.
+        `world_from_camera` [4, 4] is the pose that is believed: a drifting one or the true. Pixels
+        that are not finite are left out.
         """
         rows, cols = np.nonzero(np.isfinite(depth_m))
-        k = lens or self.camera.intrinsics
+        k = self.camera.intrinsics
         z = depth_m[rows, cols].astype(np.float64)
         x = (self.left + cols * self.step_px - k.cx_px) / k.focal_px * z
         y = (self.top + rows * self.step_px - k.cy_px) / k.focal_px * z
@@ -87,12 +76,12 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Light of the place where the device stands, beside the device's own.
+    """Light of the place where the device stands, next to the device's own.
 
     Attributes:
         area: a light with shadows.
-        ambient: radiance of light from all sides, in place of the sensor's `ambient`; None: that.
-            Both are in the units of the sensor's.
+        ambient: radiance of light from all sides, in place of the sensor's `ambient` and in its
+            units; None: that.
     """
 
     area: AreaLight | None = None
@@ -101,12 +90,7 @@ class Lighting:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame in the making: what `DepthSensor.take` works with.
-
-    Attributes:
-        camera: at its true pose, with the window that the box covers.
-        bodies, box_m, renderer, rng, explain, lighting: as in `DepthSensor.scan`.
-    """
+    """A frame in the making: what `DepthSensor.scan` was given, its window in `camera`."""
 
     camera: Camera
     bodies: tuple[Body, ...]
@@ -127,11 +111,8 @@ class Shot:
 
     def scene(self, projector: Projector | None, ambient: float) -> Scene:
         """The bodies in the sensor's light and in that of the place; `ambient` is the sensor's."""
-        if self.lighting is None:
-            return Scene(self.bodies, projector, ambient)
-        if self.lighting.ambient is not None:
-            ambient = self.lighting.ambient
-        place = self.lighting
+        place = self.lighting or Lighting()
+        ambient = ambient if place.ambient is None else place.ambient
         return Scene(self.bodies, projector, ambient, place.area)
 
     def image(self, projector: Projector | None = None, ambient: float = 0.0) -> Image:
@@ -140,9 +121,9 @@ class Shot:
         (image,) = self.renderer.render(scene, [self.camera], seed=self.seed(), geometry=[True])
         return image
 
-    def pose_at(self, right_m: float, down_m: float = 0.0) -> np.ndarray:
-        """[4, 4] pose of a device so far from the camera, looking the same way."""
-        return self.camera.moved((right_m, down_m, 0.0)).world_from_camera
+    def pose_at(self, right_m: float) -> np.ndarray:
+        """[4, 4] pose of a device so far right of the camera, looking the same way."""
+        return self.camera.moved((right_m, 0.0, 0.0)).world_from_camera
 
     def reached_from(self, world_from_source: np.ndarray) -> np.ndarray:
         """[h, w] bool: whether a surface is seen, and can be seen from another pose, too."""
@@ -155,12 +136,10 @@ class Shot:
         projector: np.ndarray,
         other: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Put shadow and occlusion before `reason` where `explain` asks for it.
+        """Put shadow and occlusion before `reason` [h, w] uint8 where `explain` asks for it.
 
-        Args:
-            reason: [h, w] uint8 of matcher and filters.
-            pictures: with "clean"; gets "lit" and, with another camera, "seen".
-            projector, other: [4, 4] poses of the projector and of the other camera.
+        `pictures` has "clean" and gets "lit" and, with another camera, "seen"; `projector` and
+        `other` are the poses [4, 4] of the projector and of that camera.
         """
         if not self.explain:
             return reason
@@ -187,8 +166,8 @@ class Shot:
     ) -> DepthFrame:
         """The finished frame of `depth_m` and `reason` at samples, by default of every pixel.
 
-        What is true is read off `image`, which covers the whole window. `intrinsics` are what the
-        device believes of its camera, where that is not the truth.
+        `image` has what is true, over the whole window; `intrinsics` are what the device believes
+        of its camera, where that is not the truth.
         """
         at = at or self.samples()
         return DepthFrame(
@@ -202,7 +181,6 @@ class Shot:
             at.of(image.cosine),
             reason,
             pictures,
-            self.camera.intrinsics if intrinsics else None,
         )
 
 
@@ -289,41 +267,22 @@ class TriangulatingSensor(DepthSensor):
 
     def __post_init__(self) -> None:
         assert self.min_depth_m < self.max_depth_m, "min_depth_m must be below max_depth_m"
-        matcher = self._matcher
+        matcher = getattr(self, "matcher", None)
         unbiased = isinstance(matcher, StereoBlockMatcher) and matcher.remove_bias
         # k / 16 less nearly half a step would be rounded straight back to k / 16.
-        undone = unbiased and self.quantiser.steps_per_px == matcher.steps_per_px
+        undone = unbiased and self.quantiser.steps_per_px == 16
         assert not undone, "quantiser.steps_per_px=16 undoes matcher.remove_bias"
-
-    @property
-    def _matcher(self) -> Any:
-        """Of a kind that matches images, or None."""
-        return getattr(self, "matcher", None)
 
     @property
     def zero_disparity_px(self) -> float:
         """Disparity f b / Z of a point that the matcher gives 0: 0 for two parallel cameras."""
         return 0.0
 
-    @property
-    def steps_per_px(self) -> int:
-        """Even steps of the disparity that its values have; 0 where there are none.
-
-        A quantiser finer than the matcher's own steps adds none to them, unless a filter between
-        the two makes other values.
-        """
-        steps: int = self.quantiser.steps_per_px
-        if not all(getattr(post, "keeps_steps", False) for post in self.filters):
-            return steps
-        own: int = getattr(self._matcher, "steps_per_px", 0)
-        return min(steps, own) if steps and own else steps or own
-
     def depth_of(self, match: Match) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Filter, quantise, triangulate, in this order.
 
         Returns:
-            [h, w] float32 depth in metres with NaN; [h, w] float32 disparity as used, with NaN;
-            [h, w] uint8 `Reason`.
+            [h, w] float32 depth in metres and disparity as used, with NaN; [h, w] uint8 `Reason`.
         """
         disparity, reason = match.disparity, match.reason
         for post in self.filters:

@@ -29,7 +29,7 @@ _BEND = 1e-3  # of 1 / Z, second difference over neighbours: more is an edge
 
 @dataclass(frozen=True)
 class View:
-    """One camera's pixels. Tensors [h, w] float64 unless said otherwise.
+    """One camera's pixels: tensors [h, w] float64.
 
     Attributes:
         window: which pixels of the whole image.
@@ -38,7 +38,6 @@ class View:
         albedo: mean over the pixel; 0 where nothing is.
         lit: share of the pixel that the projector reaches.
         smooth: bool; the surface goes on in all four directions, so it is no silhouette.
-        depth_m: at the pixels' centres, inf where nothing is.
     """
 
     window: Window
@@ -46,7 +45,6 @@ class View:
     albedo: torch.Tensor
     lit: torch.Tensor
     smooth: torch.Tensor
-    depth_m: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -64,17 +62,11 @@ def pair_of(
     box_m: np.ndarray,
     world_from_camera: np.ndarray,
     renderer: Renderer,
-    samples_seed: int = 0,
 ) -> Pair:
     """Render what the twin of a sensor needs of a scene of matt bodies.
 
-    Args:
-        sensor: its cameras and projector; its light and exposure do not matter here.
-        bodies: the scene; matt, as the twin is.
-        box_m: [2, 3] of the world: only the pixels that it covers are rendered.
-        world_from_camera: [4, 4] pose of the left camera.
-        renderer: gives geometry, albedo and shadows.
-        samples_seed: of the renderer's sampling.
+    `box_m` [2, 3] of the world limits the pixels, `world_from_camera` [4, 4] is the pose of the
+    left camera, and the renderer gives geometry, albedo and shadows.
     """
     assert all(body.gloss is None for body in bodies), "the twin has matt bodies only"
     k = sensor.intrinsics
@@ -87,14 +79,9 @@ def pair_of(
         window = window_of(box_m, camera, margin_px=sensor.margin_px)
         assert window is not None, "the box is outside the view of one of the cameras"
         camera = replace(camera, window=window)
-        (even,) = renderer.render(
-            Scene(bodies, None, 1.0), [camera], seed=samples_seed, geometry=[True]
-        )
-        (lit,) = renderer.render(
-            Scene(bodies, white), [camera], seed=samples_seed, geometry=[False]
-        )
-        projector_x = sensor.baseline_m / 2 - shift
-        views.append(_view(camera, even, lit.radiance, projector_x))
+        (even,) = renderer.render(Scene(bodies, None, 1.0), [camera], seed=0, geometry=[True])
+        (lit,) = renderer.render(Scene(bodies, white), [camera], seed=0, geometry=[False])
+        views.append(_view(camera, even, lit.radiance, sensor.baseline_m / 2 - shift))
     return Pair(sensor, *views)
 
 
@@ -128,7 +115,7 @@ def _view(camera: Camera, even: Image, lit: np.ndarray, projector_x: float) -> V
         facing = np.abs(normal[..., 0] * px + normal[..., 1] * py - normal[..., 2] * z)
         share = lit / (albedo * facing / z**3)
     share = np.clip(np.nan_to_num(share, posinf=0.0), 0, 1)
-    tensors = (plane, albedo, share, smooth, np.where(there, 1 / inverse, np.inf))
+    tensors = (plane, albedo, share, smooth)
     return View(camera.rendered, *(torch.from_numpy(np.ascontiguousarray(t)) for t in tensors))
 
 
@@ -152,14 +139,8 @@ Settings = Mapping[str, torch.Tensor]
 
 
 def settings_of(pair: Pair, gain: float) -> dict[str, torch.Tensor]:
-    """The sensor's own numbers, each a float64 tensor without gradient, and `gain`.
-
-    Keys: projector_strength, ambient, baseline_m, focal_px, gain (grey values per radiance),
-    infrared.psf_px, infrared.electrons_at_white, infrared.read_noise_e,
-    infrared.speckle_contrast; and albedo, a factor of all albedos (1).
-    """
-    sensor = pair.sensor
-    camera = sensor.infrared
+    """The sensor's own numbers, `gain` in grey values per radiance, and a factor of all albedos."""
+    sensor, camera = pair.sensor, pair.sensor.infrared
     assert isinstance(camera, InfraredCamera)
     numbers = {
         "projector_strength": sensor.projector_strength,
@@ -178,12 +159,12 @@ def settings_of(pair: Pair, gain: float) -> dict[str, torch.Tensor]:
 
 @dataclass(frozen=True)
 class Twin:
-    """A differentiable speckle-stereo sensor before one scene.
+    """A differentiable speckle-stereo sensor in front of one scene.
 
     Attributes:
         pair: what its cameras see.
         fine: samples along each side of a pixel; 4 is the 16 samples of the renderers.
-        slide: [H, W] float64 in 0..1; None: the sensor's. May want a gradient.
+        slide: [H, W] float64 in 0..1; None: the sensor's.
     """
 
     pair: Pair
@@ -231,24 +212,17 @@ class Twin:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Both exposures [h, w] float64, 0..255.
 
-        Args:
-            settings: see `settings_of`.
-            noise: of speckle, photons and read-out, drawn anew at each call; None: none, and
-                no rounding either. Ambient light has speckle where the sensor's has.
-            whole: noisy images are rounded to grey values; gradients pass as if they were not.
+        `noise` is of speckle, photons and read-out; None: none, and no rounding either. If `whole`,
+        noisy images are rounded to grey values; gradients pass as if they were not.
         """
         camera = self.pair.sensor.infrared
-        longest, apart = None, False
-        if isinstance(camera, InfraredCamera):
-            longest, apart = camera.max_exposure, not camera.ambient_speckles
-        light = settings["albedo"] * settings["ambient"]
-        first, second = (
-            exposed(image, settings, noise, whole, light * view.albedo if apart else None, longest)
-            for image, view in zip(
-                self.radiance(settings), (self.pair.left, self.pair.right), strict=True
-            )
-        )
-        return first, second
+        assert isinstance(camera, InfraredCamera)
+        light, pictures = settings["albedo"] * settings["ambient"], []
+        views = (self.pair.left, self.pair.right)
+        for image, view in zip(self.radiance(settings), views, strict=True):
+            even = None if camera.ambient_speckles else light * view.albedo
+            pictures.append(exposed(image, settings, noise, whole, even, camera.max_exposure))
+        return pictures[0], pictures[1]
 
     def disparity(
         self,
@@ -259,17 +233,12 @@ class Twin:
         block_px: int = 15,
         sharpness: float = 80.0,
     ) -> torch.Tensor:
-        """[h, w] float64 disparity of the left image's pixels, px.
+        """[h, w] float64 disparity in px of the left image's pixels.
 
-        Args:
-            left, right: exposures over the views' windows.
-            lowest, highest: whole disparities; looked at from the one to the other in quarters.
-            block_px: side of the block that is correlated, odd.
-            sharpness: of the soft argmax, per unit of correlation.
+        Looked at are `lowest` to `highest` in quarters, over blocks of side `block_px`, odd;
+        `sharpness` is that of the soft argmax, per unit of correlation.
         """
         offset = self.pair.left.window.left - self.pair.right.window.left
-        rows = self.pair.left.window.top - self.pair.right.window.top
-        assert rows == 0
         cost = correlations(left, right, offset, lowest, highest, block_px)
         return lowest + soft_argmax(cost, sharpness) / STEPS
 
@@ -286,10 +255,9 @@ def exposed(
     even: torch.Tensor | None = None,
     max_exposure: float | None = None,
 ) -> torch.Tensor:
-    """[h, w] grey values of `radiance` [h, w]; see `Twin.grey`.
+    """[h, w] grey values of `radiance`, of which `even` [h, w] has no speckle; see `Twin.grey`.
 
-    `even` [h, w] is the part of the radiance that has no speckle; None: nothing. Gain above
-    `max_exposure` amplifies the noise, too; None: all of the gain is exposure.
+    Gain above `max_exposure` amplifies the noise, too; None: all of the gain is exposure.
     """
     contrast = settings["infrared.speckle_contrast"]
     if noise is not None and float(contrast.detach()) > 0:
@@ -327,18 +295,12 @@ def blurred(image: torch.Tensor, sigma_px: torch.Tensor) -> torch.Tensor:
     """[h, w] through a Gaussian whose width may want a gradient; 0 outside the image."""
     if float(sigma_px.detach()) <= 0:
         return image
-    kernel = gaussian(sigma_px).to(image.dtype)
-    reach = len(kernel) // 2
-    rows = F.conv2d(image[None, None], kernel[None, None, None], padding=(0, reach))
-    return F.conv2d(rows, kernel[None, None, :, None], padding=(reach, 0))[0, 0]
-
-
-def gaussian(sigma_px: torch.Tensor) -> torch.Tensor:
-    """[n] the lens's kernel along one axis, n odd; sums to 1. Its width may want a gradient."""
     reach = max(1, math.ceil(_REACH * float(sigma_px.detach())))
     place = torch.arange(-reach, reach + 1, dtype=sigma_px.dtype)
     kernel = torch.exp(-(place**2) / (2 * sigma_px**2))
-    return kernel / kernel.sum()
+    kernel = (kernel / kernel.sum()).to(image.dtype)
+    rows = F.conv2d(image[None, None], kernel[None, None, None], padding=(0, reach))
+    return F.conv2d(rows, kernel[None, None, :, None], padding=(reach, 0))[0, 0]
 
 
 def _gamma_like(
@@ -346,11 +308,9 @@ def _gamma_like(
 ) -> torch.Tensor:
     """Gamma variables with mean 1, whose gradient by the contrast is an implicit one."""
     shape = 1 / contrast**2
-    seed = int(torch.randint(2**31, (), generator=noise))
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        drawn = torch.distributions.Gamma(shape, shape).rsample(image.shape)
-    return drawn
+        torch.manual_seed(int(torch.randint(2**31, (), generator=noise)))
+        return torch.distributions.Gamma(shape, shape).rsample(image.shape)
 
 
 def correlations(

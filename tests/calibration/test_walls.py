@@ -56,7 +56,7 @@ def recovered(folder, hidden, poses=POSES, **more):
     files = [folder / f"{i}.npy" for i in range(len(poses))]
     for i, (depth, tilt) in enumerate(poses):
         np.save(files[i], wall(hidden, depth, tilt, seed=i))
-    text = fit_walls(files, None, hidden.focal_px, **more).text()
+    text, _ = fit_walls(files, None, hidden.focal_px, **more)
     given = yaml.safe_load(text)
     assert given.pop("_target_") == "qs3.sensors.devices.fitted.FittedDepth"
     return FittedDepth(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})

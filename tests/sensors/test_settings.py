@@ -4,13 +4,12 @@ import pytest
 
 from qs3.sensors.devices.blensor_kinect import DotMask
 from qs3.sensors.devices.fitted import FittedDepth
-from qs3.sensors.devices.fringe import FringeProjection
+from qs3.sensors.devices.fringe import FringeCode, FringeProjection
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.devices.time_of_flight import TimeOfFlight
 from qs3.sensors.matching import CensusMatcher, ReferenceMatcher, StereoBlockMatcher
 from qs3.sensors.matching.filters import Quantiser
-from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import ReleasedSlide, Speckle
 from qs3.sensors.renderers.blender import BlenderRenderer

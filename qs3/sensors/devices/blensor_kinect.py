@@ -6,12 +6,10 @@ seen where the same depth would put them: the projector reaches them, and what i
 as far away. The value is rounded to 1/8 px and given to the few pixels around the dot. So depth
 has the shadows of a projector, the device's steps and frayed edges, but no matching errors.
 
-BlenSor's own values are kept where it documents them (its Kinect's default parameters): a window
-of 9 x 9 px, more than 2/3 of its dots, an inlier distance of 0.05 m, 1/8 px, a fill radius of
-3.1 px, no independent noise, and a smooth noise field of strength 0.25 over cells of 32 px.
-Ours: the dots (a drawn pattern in place of a recorded one), that they stay fixed in the projector
-and not in the image, that the field is band-limited, and its size in pixels: 0.06 px rms,
-about that of gradient noise of strength 0.25.
+Values are BlenSor's where it documents them (its Kinect's default parameters). Ours: the dots (a
+drawn pattern in place of a recorded one), that they stay fixed in the projector and not in the
+image, that the noise field is band-limited, and its size in pixels: 0.06 px rms, about that of
+gradient noise of strength 0.25.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A camera as a few frames of a wall describe it: true depth plus fitted noise.
 
-Here noise is added to a depth map. That is all that depth frames can tell; the speckle sensors,
-whose noise comes out of matched images, need more than that. `qs3 fit` writes
-presets of this sensor.
+That is all that depth frames can tell; the speckle sensors, whose noise comes out of matched
+images, need more. `qs3 fit` writes presets of this sensor.
 """
 
 from __future__ import annotations
@@ -83,12 +82,9 @@ class FittedDepth(DepthSensor):
     def measure(
         self, clean_m: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Depths that the camera measures where `clean_m` [h, w] are true, inf where nothing is.
+        """Measure true depths [h, w], inf where nothing is: float32 with NaN, and uint8 `Reason`.
 
-        `cosine` [h, w] float32 is that of the angle of incidence.
-
-        Returns:
-            [h, w] float32 depth with NaN; [h, w] uint8 `Reason`.
+        `cosine` [h, w] is that of the angle of incidence.
         """
         noise = _smooth(clean_m.shape, self.correlation_px / self.step_px, rng)
         hit = np.isfinite(clean_m)
@@ -124,18 +120,12 @@ class FittedDepth(DepthSensor):
         return shot.frame(depth, reason, image, pictures, at)
 
 
-def _kernel(size_px: float) -> np.ndarray:
-    """[k] float32 Gaussian that sums to 1."""
-    reach = max(1, round(4 * size_px))
-    return cv2.getGaussianKernel(2 * reach + 1, max(size_px, 1e-6), cv2.CV_32F)[:, 0]
-
-
 def _smooth(shape: tuple[int, ...], size_px: float, rng: np.random.Generator) -> np.ndarray:
     """[h, w] float32 normal noise of variance 1, correlated over size_px."""
     if size_px <= 0 or 0 in shape:
         return rng.standard_normal(shape, dtype=np.float32)
-    kernel = _kernel(size_px)
-    reach = len(kernel) // 2  # drawn beyond the border, where mirrored noise would be stronger
+    reach = max(1, round(4 * size_px))  # drawn beyond the border: mirrored noise would be stronger
+    kernel = cv2.getGaussianKernel(2 * reach + 1, max(size_px, 1e-6), cv2.CV_32F)[:, 0]
     white = rng.standard_normal([side + 2 * reach for side in shape], dtype=np.float32)
     smooth = cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel)[reach:-reach, reach:-reach]
     return smooth / np.float32((kernel**2).sum())

@@ -1,28 +1,41 @@
 """Fringe projection: structured light with sinusoids, one camera and one projector.
 
+N-step phase shifting with temporal unwrapping: slide n of P periods shows
+
+    (1 + cos(2 pi P s + 2 pi n / N)) / 2,        0 <= s <= 1 across the slide,
+
+and a pixel sees I_n = a + M cos(phase + 2 pi n / N). The phase follows from the discrete Fourier
+sums of the I_n, whatever a (ambient light) and M (albedo, distance, blur) are; it is known up to
+whole periods, which the next coarser fringes tell (Huntley and Saldner, Applied Optics 32(17),
+1993). With noise of standard deviation sigma_n in each I_n, independent,
+
+    sigma_phase = sqrt(2 / N) sigma_n / M,        sigma_s = sigma_phase / (2 pi P)
+
+of the finest fringes. It holds with the mean variance where the noise depends on the signal, for
+N >= 4 (shot noise is proportional to I_n, and the sum of cos sin^2 over the steps vanishes).
+
 The camera's ray through u meets the plane of light that leaves the projector at x / z = x_p. The
 projector looks the same way at a distance b from the camera, so x_p = x - b / Z with
-x = (u - cx) / f, and Z = f b / d with the disparity d = f (x - x_p). The place on the
-slide comes from phase shifting (`optics.fringe_code`), so
+x = (u - cx) / f, and Z = f b / d with the disparity d = f (x - x_p). So
 
     sigma_Z = Z^2 / b * 2 tan_half_width * sigma_s
 
 A view costs one render and one exposure a slide, and one render to know where the renderer's
-samples lie in their pixels: 13 with the defaults, where a speckle sensor needs one or two. The
-scene must stand still meanwhile, as it does here.
+samples lie in their pixels. The scene must stand still meanwhile, as it does here.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import field
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Interval
+from annotated_types import Ge, Interval
 
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
-from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.visibility import Reason, first_reason, sample_centres
 from qs3.sensors.renderers.base import Image, Projector, tangents
@@ -30,14 +43,75 @@ from qs3.utils.settings import NotNegative, Positive, settings
 
 
 @settings
+class FringeCode:
+    """Which slides are thrown.
+
+    Attributes:
+        periods: across the slide, from coarse to fine; the first is at most 1, so that it is
+            not ambiguous.
+        steps: N, slides of each.
+        columns, rows: of a slide. A renderer interpolates slides linearly, so a period needs at
+            least 8 pixels; with 16 the sinusoid's error is 0.4 % (its harmonics 15 and 17).
+    """
+
+    periods: tuple[Positive, ...] = (1.0, 8.0, 64.0)
+    steps: Annotated[int, Ge(3)] = 4
+    columns: Annotated[int, Ge(2)] = 1024
+    rows: Annotated[int, Ge(2)] = 768
+
+    def __post_init__(self) -> None:
+        assert self.periods == tuple(sorted(set(self.periods))), "code.periods must increase"
+        assert self.periods[0] <= 1, "code.periods must begin with at most 1 period"
+        assert self.periods[-1] * 8 <= self.columns, "a period needs 8 px of the slide"
+
+    @cached_property
+    def slides(self) -> np.ndarray:
+        """[F, N, rows, columns] float32 in 0..1."""
+        s = (np.arange(self.columns) + 0.5) / self.columns
+        angle = (
+            2 * np.pi * np.multiply.outer(np.array(self.periods), s)[:, None]
+            + (2 * np.pi / self.steps) * np.arange(self.steps)[None, :, None]
+        )
+        wave = ((1 + np.cos(angle)) / 2).astype(np.float32)  # [F, N, length]
+        return np.broadcast_to(wave[..., None, :], (*wave.shape[:2], self.rows, self.columns))
+
+    def decode(self, exposures: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places on the slide, from `exposures` [F, N, h, w] in the order of `slides`.
+
+        Returns:
+            [h, w] float64 s; [F, h, w] modulation M in the exposures' units; [h, w] how far, in
+            periods of the finer fringes, the least fitting pair of neighbouring fringes is apart,
+            0..0.5.
+        """
+        phase, modulation = phase_of(exposures)
+        turns = phase[0] / (2 * np.pi) % 1  # periods of the first fringes, counted from s = 0
+        worst = np.zeros_like(turns)
+        for level in range(1, len(self.periods)):
+            fraction = phase[level] / (2 * np.pi)
+            expected = turns * (self.periods[level] / self.periods[level - 1])
+            whole = np.rint(expected - fraction)
+            turns = whole + fraction
+            worst = np.maximum(worst, np.abs(expected - turns))
+        return turns / self.periods[-1], modulation, worst
+
+
+def phase_of(exposures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Phase in -pi..pi and modulation [..., h, w] of N equal steps [..., N, h, w]."""
+    steps = exposures.shape[-3]
+    angle = (2 * np.pi / steps) * np.arange(steps)
+    real = np.einsum("n,...nhw->...hw", np.cos(angle), exposures, optimize=False)
+    imaginary = -np.einsum("n,...nhw->...hw", np.sin(angle), exposures, optimize=False)
+    return np.arctan2(imaginary, real), np.hypot(real, imaginary) * (2 / steps)
+
+
+@settings
 class FringeProjection(TriangulatingSensor):
     """A camera and a projector of fringes to the right of it. All numbers are ours.
 
     Attributes:
-        tan_half_width: half the width of the slide at distance 1.
-        projector_strength, ambient: as in SpeckleStereo.
+        tan_half_width, projector_strength, ambient: as in SpeckleStereo.
         code: the slides.
-        infrared: from radiance to grey values; all exposures share one gain.
+        infrared: all exposures share one gain.
         min_modulation: pixels with a weaker modulation (grey values) at any fringes are dark.
         max_misfit: pixels where neighbouring fringes differ by more (in periods of the finer,
             0.5 accepts all) are ambiguous.
@@ -66,12 +140,12 @@ class FringeProjection(TriangulatingSensor):
     def depth_sigma_m(
         self, depth_m: float, noise: float | np.ndarray, modulation: float | np.ndarray
     ) -> float | np.ndarray:
-        """The law of the module's docstring, at depth Z.
+        """sigma_Z at depth Z, by the module's law.
 
-        `noise` is the standard deviation of one exposure in grey values, rounding included, and
-        `modulation` that of the finest fringes in grey values.
+        `noise` is sigma_n, rounding included, and `modulation` M, both in grey values.
         """
-        place = self.code.place_sigma(noise, modulation)
+        phase = math.sqrt(2 / self.code.steps) * noise / modulation
+        place = phase / (2 * np.pi * self.code.periods[-1])
         return depth_m**2 / self.baseline_m * 2 * self.tan_half_width * place
 
     def take(self, shot: Shot) -> DepthFrame:

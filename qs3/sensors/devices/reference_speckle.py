@@ -34,8 +34,7 @@ class ReferenceSpeckle(TriangulatingSensor):
         reference_m: distance of the plane whose image is stored. It places the search range.
         tan_half_width: half the width of the slide at distance 1.
         ambient: as in SpeckleStereo, relative to the pattern on white at `reference_m`.
-        pattern, matcher, infrared: as in SpeckleStereo; ReferenceMatcher has a quantiser of its
-            own, beside which a finer one of the sensor changes nothing.
+        pattern, matcher, infrared: as in SpeckleStereo.
     """
 
     reference_m: Positive = 1.6
@@ -76,8 +75,7 @@ class ReferenceSpeckle(TriangulatingSensor):
     def reference(self) -> np.ndarray:
         """[height_px, width_px] float32 stored image, 0..255: the slide on the plane.
 
-        Computed from the geometry with 8 x 8 samples a pixel, without noise: a device
-        averages many frames for it.
+        With 8 x 8 samples a pixel and without noise: a device averages many frames for it.
         """
         slide = self.pattern.slide
         rows, cols = slide.shape

@@ -18,9 +18,9 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-from qs3.geometry.cameras import Camera, Intrinsics, Window
+from qs3.geometry.cameras import Camera, Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
-from qs3.sensors.matching import Match, Matcher, StereoBlockMatcher
+from qs3.sensors.matching import Matcher, StereoBlockMatcher
 from qs3.sensors.matching.base import for_picture, found_px
 from qs3.sensors.optics.infrared import FilmicCamera, InfraredCamera
 from qs3.sensors.optics.misalignment import Misalignment
@@ -37,13 +37,12 @@ class SpeckleStereo(TriangulatingSensor):
     Attributes:
         step_px: every step-th pixel of every step-th row gives a depth (1080 / 4 = 270).
         tan_half_width: half the width of the projected slide at distance 1.
-        ambient: radiance of the fill light relative to the pattern's on a white surface
-            at 4 m; it lowers the contrast.
+        ambient: radiance of a white surface in the fill light, which lowers the contrast.
         pattern: the slide.
         matcher: finds the left image in the right one.
         infrared: from radiance to grey values.
         projector_strength: radiance of a white surface under a lit dot at 1 m; at 16, white at
-            4 m has radiance 1. `ambient` is in the same units.
+            4 m has radiance 1.
         sample_offset_px: first column and row that are kept; null: the middle of each step.
         centre_error_px: error of the principal point in back-projection, right and down. The
             released code has 0.5: it takes pixel centres for integers where they are halves,
@@ -101,22 +100,26 @@ class SpeckleStereo(TriangulatingSensor):
         images = shot.renderer.render(scene, cameras, seed=seed, geometry=[True, False])
         windows = (shot.window, window)
         canvas = self._canvas(*windows)
-        gain = self.infrared.gain(
-            images[0].radiance, self.infrared.metered(images[0], usual="object")
-        )
+        metered = self.infrared.metered(images[0], usual="object")
+        gain = self.infrared.gain(images[0].radiance, metered)
         radiance = self._seen(images, windows, canvas)
-        if isinstance(self.infrared, InfraredCamera) and self.infrared.needs_ambient:
+        ambient: list[np.ndarray] | list[None] = [None, None]
+        if self.infrared.needs_ambient:
             # The same seed: the same places in each pixel.
             dim = shot.scene(None, self.ambient)
             others = shot.renderer.render(dim, cameras, seed=seed, geometry=[False, False])
             ambient = self._seen(others, windows, canvas)
-            grey = [
-                self.infrared.expose(total, gain, shot.rng, other)
-                for total, other in zip(radiance, ambient, strict=True)
-            ]
-        else:
-            grey = [self.infrared.expose(total, gain, shot.rng) for total in radiance]
-        match = self._match(grey[0], grey[1], canvas.left, gain)
+        grey = [
+            self.infrared.expose(total, gain, shot.rng, other)
+            for total, other in zip(radiance, ambient, strict=True)
+        ]
+        matcher = self.matcher
+        if isinstance(self.infrared, InfraredCamera):
+            matcher = for_picture(matcher, self.infrared.noise(gain))
+        match = matcher.match(grey[0], grey[1])
+        if self.blind_left_px:
+            blind = slice(0, max(0, self.blind_left_px - canvas.left))
+            match.reason[:, blind], match.disparity[:, blind] = Reason.OUTSIDE, np.nan
         depth, disparity, reason = self.depth_of(match)
         inside = replace(
             shot.window, left=shot.window.left - canvas.left, top=shot.window.top - canvas.top
@@ -129,8 +132,9 @@ class SpeckleStereo(TriangulatingSensor):
         }
         reason = shot.explained(reason[inside], pictures, middle, right)
         at = shot.samples(self.step_px, self.sample_offset_px)
-        depth = at.of(depth[inside])
-        return shot.frame(depth, at.of(reason), images[0], pictures, at, self._believed)
+        k, error = self.intrinsics, self.centre_error_px
+        believed = replace(k, cx_px=k.cx_px + error, cy_px=k.cy_px + error)
+        return shot.frame(at.of(depth[inside]), at.of(reason), images[0], pictures, at, believed)
 
     def _seen(
         self, images: Sequence[Image], windows: Sequence[Window], canvas: Window
@@ -139,29 +143,11 @@ class SpeckleStereo(TriangulatingSensor):
         left, right = (_place(*seen, canvas) for seen in zip(images, windows, strict=True))
         return [left, self.misalignment.seen(right, canvas, self.intrinsics)]
 
-    def _match(self, left: np.ndarray, right: np.ndarray, first_column: int, gain: float) -> Match:
-        """What the matcher finds; `first_column` is the canvas's first in the whole image."""
-        matcher = self.matcher
-        if isinstance(self.infrared, InfraredCamera):
-            matcher = for_picture(matcher, self.infrared.noise(gain))
-        match = matcher.match(left, right)
-        if self.blind_left_px:
-            blind = slice(0, max(0, self.blind_left_px - first_column))
-            match.reason[:, blind], match.disparity[:, blind] = Reason.OUTSIDE, np.nan
-        return match
-
-    @property
-    def _believed(self) -> Intrinsics:
-        """What back-projection takes for the intrinsics."""
-        true, error = self.intrinsics, self.centre_error_px
-        return replace(true, cx_px=true.cx_px + error, cy_px=true.cy_px + error)
-
     def _canvas(self, left: Window, right: Window) -> Window:
         """Where both images lie side by side, with room for the matcher's reach around them.
 
-        What is outside the rendered windows is dark. Where the object stands alone, nothing is
-        there; in a room a strip of background right of the object has no match by it, whose
-        disparity is smaller than the object's.
+        What is outside the rendered windows is dark. In a room a strip of background right of the
+        object, whose disparity is smaller, has no match by it.
         """
         margin = 2 * self.matcher.reach_px
         first = min(left.left, right.left) - margin
@@ -172,7 +158,7 @@ class SpeckleStereo(TriangulatingSensor):
 
 
 def _place(image: Image, window: Window, canvas: Window) -> np.ndarray:
-    """The radiance of `window` on a dark canvas; pixels that see nothing are dark too."""
+    """The radiance of `window` on a dark canvas."""
     out = np.zeros((canvas.height, canvas.width), dtype=np.float32)
     row, col = window.top - canvas.top, window.left - canvas.left
     out[row : row + window.height, col : col + window.width] = image.radiance

@@ -18,10 +18,9 @@ with N = K (R + B) + r^2, because I_0 + I_2 = I_1 + I_3 = 2 K (R + B). So to fir
     sigma_d = c / (4 pi f) sigma_phase = c / (4 pi f) sqrt(N) / (sqrt(2) A)
 
 (Lange and Seitz, IEEE J. Quantum Electronics 37(3), 2001, have the same law). It grows with the
-distance where the lamp's shot noise rules, as A and N fall with the square, and with the square of
-the distance where the read-out or other light does. Several frequencies, each weighed with
-1 / sigma^2, give the sigma of f = sqrt(f_1^2 + f_2^2 + ...). One frequency cannot tell d from
-d + c / (2 f).
+distance where the lamp's shot noise rules, and with its square where the read-out or other light
+does. Several frequencies, each weighed with 1 / sigma^2, give the sigma of
+f = sqrt(f_1^2 + f_2^2 + ...). One frequency cannot tell d from d + c / (2 f).
 
 Not simulated: light that bounces between surfaces (multipath), because renderers do not say how far
 it went; higher harmonics of the modulation; motion between buckets.
@@ -100,10 +99,7 @@ class TimeOfFlight(DepthSensor):
     def distance_sigma_m(
         self, amplitude_e: float | np.ndarray, mean_e: float | np.ndarray
     ) -> float | np.ndarray:
-        """Standard deviation in metres along the ray, of all frequencies together: the law above.
-
-        `amplitude_e` is A and `mean_e` K (R + B), in electrons a bucket.
-        """
+        """The law above, along the ray, from A and K (R + B) in electrons a bucket."""
         together = sum(f**2 for f in self.frequencies_hz) ** 0.5
         noise = np.sqrt(mean_e + self.read_noise_e**2) / (math.sqrt(2) * amplitude_e)
         return SPEED_OF_LIGHT / (4 * math.pi * together) * noise
@@ -214,10 +210,7 @@ def unwrapped(
 
     Every number of whole periods of the first frequency is tried; what the others then lack is
     weighed with 1 / sigma^2, which is proportional to (f A)^2 as the buckets' mean is common.
-
-    Args:
-        phase, amplitude: [F, h, w] in 0..2 pi, and in electrons, for the weights.
-        frequencies_hz: F of them.
+    `phase` in 0..2 pi and `amplitude` are [F, h, w].
 
     Returns:
         [h, w] half the path in metres, in 0..c / (2 gcd); [h, w] the largest difference of one
@@ -250,7 +243,7 @@ def _pixel_mean(fine: np.ndarray, n: int) -> np.ndarray:
 
 
 def _grey(image: np.ndarray) -> np.ndarray:
-    """[h, w] of any scale -> uint8 for looking at: the 98 % quantile of what is lit at 220."""
+    """A picture [h, w] uint8 for looking at: the 98 % quantile of what is lit at 220."""
     lit = image[image > 0]
     white = float(np.quantile(lit, 0.98)) if lit.size else 1.0
     return np.clip(np.rint(image * (220 / white)), 0, 255).astype(np.uint8)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, ClassVar, Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -31,11 +31,7 @@ class Quantiser:
 
 @runtime_checkable
 class PostFilter(Protocol):
-    """Changes or drops disparities.
-
-    One whose class has `keeps_steps = True` gives no value that was not there before, so that the
-    matcher's own steps stay.
-    """
+    """Changes or drops disparities."""
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """[h, w] float32 px with NaN -> the same, changed; dropped values are NaN."""
@@ -50,7 +46,6 @@ class SmallRegions:
         max_step_px: neighbours (of 4) belong together if they differ by at most this.
     """
 
-    keeps_steps: ClassVar[bool] = True
     max_size_px: Annotated[int, Ge(0)] = 50
     max_step_px: Positive = 1.0
 

@@ -41,11 +41,6 @@ class StereoBlockMatcher:
     max_difference_px: int = -1
 
     @property
-    def steps_per_px(self) -> int:
-        """OpenCV's own steps."""
-        return 16
-
-    @property
     def reach_px(self) -> int:
         """Half a block and a pixel of the Sobel filter."""
         return self.block_size // 2 + 1

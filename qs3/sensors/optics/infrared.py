@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -15,12 +15,7 @@ from qs3.utils.settings import NotNegative, Positive, Share, settings
 
 @dataclass(frozen=True)
 class GreyNoise:
-    """Shot and read noise of a picture, in grey values.
-
-    Attributes:
-        electrons_at_white: electrons of grey value 255 in this picture, so fewer by the amplifier.
-        read_noise_e: standard deviation of the read-out noise in electrons.
-    """
+    """Shot and read noise of a picture, as in `InfraredCamera`."""
 
     electrons_at_white: float
     read_noise_e: float
@@ -35,9 +30,8 @@ class GreyNoise:
 class InfraredCamera:
     """A linear 8-bit sensor with automatic exposure.
 
-    Noise is drawn here and not left to Monte Carlo luck of the renderer, so that it is the
-    same whatever the number of samples a pixel. Exposure comes first, and an amplifier does the
-    rest: as many grey values of fewer electrons, so that noise grows with it.
+    Exposure comes first, and an amplifier does the rest: as many grey values of fewer electrons,
+    so that noise grows with it.
 
     Attributes:
         white_quantile: the exposure puts this quantile of the metered radiance ...
@@ -172,8 +166,7 @@ def filmic(radiance: np.ndarray) -> np.ndarray:
 class FilmicCamera:
     """A camera without noise whose picture is a tone-mapped 8-bit file, as released.
 
-    It stands where an `InfraredCamera` stands. Its exposure is fixed: radiance has to come in
-    Blender's units (see `SpeckleStereo.projector_strength`).
+    Its exposure is fixed: radiance has to come in Blender's units.
 
     Attributes:
         background: radiance of the surroundings behind the object (the released scene's grey
@@ -184,6 +177,7 @@ class FilmicCamera:
 
     background: NotNegative = 0.0
     faintest: Positive = 0.216
+    needs_ambient: ClassVar[bool] = False
 
     def metered(self, image: Image, usual: str) -> np.ndarray:
         """The pixels [h, w] bool of the object; nothing depends on them."""
@@ -193,7 +187,13 @@ class FilmicCamera:
         """1: exposure 0, whatever is seen."""
         return 1.0
 
-    def expose(self, radiance: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
+    def expose(
+        self,
+        radiance: np.ndarray,
+        gain: float,
+        rng: np.random.Generator,
+        ambient: np.ndarray | None = None,
+    ) -> np.ndarray:
         """[h, w] uint8 picture of [h, w] float32 radiance; draws nothing from `rng`."""
         light = np.asarray(radiance, dtype=np.float64) * gain
         free = np.clip(1 - light / self.faintest, 0, 1)

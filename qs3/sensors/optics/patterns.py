@@ -52,10 +52,13 @@ class Speckle:
         if self.brightness_spread:
             tile = tile * (1 - self.brightness_spread * rng.random(tile.shape))
         image = np.tile(tile, (self.tiles, self.tiles))
-        image = image.repeat(self.dot_px, axis=0).repeat(self.dot_px, axis=1)
-        image = np.ascontiguousarray(image, dtype=np.float32)
-        image.flags.writeable = False
-        return image
+        return _frozen(image.repeat(self.dot_px, axis=0).repeat(self.dot_px, axis=1))
+
+
+def _frozen(image: np.ndarray) -> np.ndarray:
+    image = np.ascontiguousarray(image, dtype=np.float32)
+    image.flags.writeable = False
+    return image
 
 
 def _spaced_dots(
@@ -91,9 +94,8 @@ class ReleasedSlide(Speckle):
 
     The released scene projects its 1266 x 990 px picture onto a square, so that its dots are higher
     than wide (3.0 x 3.8 px of the camera). And the picture is 8-bit sRGB, which Cycles
-    interpolates as stored and decodes afterwards: a dot's slopes are steeper than a linear
-    slide's, and it is smaller. The matcher locks more to whole pixels on such dots: on a plane at
-    4 m its error grows from 0.057 to 0.088 px (released scene: 0.083 px).
+    interpolates as stored and decodes afterwards: a dot is smaller and its slopes are steeper, so
+    that the matcher locks more to whole pixels.
 
     Attributes:
         detail: pixels of the slide for each of the picture, after interpolation.
@@ -116,7 +118,5 @@ class ReleasedSlide(Speckle):
         ).slide
         side = stored.shape[1] * self.detail
         smooth = cv2.resize(stored, (side, side), interpolation=cv2.INTER_LINEAR)
-        image = np.where(smooth <= 0.04045, smooth / 12.92, ((smooth + 0.055) / 1.055) ** 2.4)
-        image = np.ascontiguousarray(image, dtype=np.float32)
-        image.flags.writeable = False
-        return image
+        steep = ((smooth + 0.055) / 1.055) ** 2.4
+        return _frozen(np.where(smooth <= 0.04045, smooth / 12.92, steep))

@@ -66,11 +66,10 @@ def white_lamp(world_from_lamp: np.ndarray) -> Projector:
 def reached_from(
     bodies: tuple[Body, ...], camera: Camera, world_from_source: np.ndarray, renderer: Renderer
 ) -> np.ndarray:
-    """[h, w] bool: whether the surface in each pixel can be seen from another place, too.
+    """[h, w] bool: whether any part of the surface in each pixel is seen from another place, too.
 
     `world_from_source` [4, 4] is the pose of the other camera or the projector, which looks along
-    its +z; what lies behind it is not reached. A pixel counts if any part of its surface is
-    reached.
+    its +z; what lies behind it is not reached.
     """
     white = tuple(replace(body, albedo=1.0, gloss=None) for body in bodies)
     scene = Scene(white, white_lamp(world_from_source))
@@ -83,10 +82,8 @@ def explained(
 ) -> np.ndarray:
     """Reasons that geometry gives, put before the [h, w] uint8 `reason` of matcher and filters.
 
-    Args:
-        clean_m: [h, w] true depth, inf where nothing is.
-        lit: [h, w] bool, reached by the projector.
-        seen: [h, w] bool, reached by the other camera; None if there is none.
+    `clean_m` [h, w] is the true depth, inf where nothing is; `lit` and `seen` [h, w] bool what
+    projector and other camera reach.
     """
     out = reason.copy()
     invalid = reason != Reason.OK
@@ -101,21 +98,14 @@ _ROOM = 1.1  # the plane and the slide are larger than the view by this factor
 
 
 def sample_centres(camera: Camera, renderer: Renderer, seed: int) -> np.ndarray:
-    """The mean column of each pixel's samples.
+    """[h, w] float64: the mean column of each pixel's samples, in px of the whole image.
 
     A renderer spreads its samples over a pixel at random, and their mean misses the pixel's centre
     by some hundredths of a pixel (0.05 px with Mitsuba's 16 samples, measured). A camera's pixel
-    has no such fluctuation. Block matching does not see it; fringes do, where it is several times
-    their noise. It depends on the seed and the pixel but not on the scene, so that it can be
-    measured: on a plane before the camera, lit from the camera by a slide that is a ramp.
-
-    Args:
-        camera: with its window.
-        renderer: asked for one image.
-        seed: of the images that are to be corrected, rendered with one camera a call.
-
-    Returns:
-        [h, w] float64, in px of the whole image: u plus some hundredths.
+    has no such fluctuation; of fringes it is several times the noise. It depends on the seed and
+    the pixel but not on the scene, so that it can be measured: on a plane in front of the camera,
+    lit from the camera by a slide that is a ramp. `seed` is that of the images to correct, which
+    are rendered with one camera a call.
     """
     k, window = camera.intrinsics, camera.rendered
     ends_x = np.abs(np.array([window.left - 1, window.left + window.width]) - k.cx_px)

@@ -78,9 +78,8 @@ class Scene:
         bodies: at least one.
         projector: None for a camera that needs no pattern.
         ambient: radiance of the surroundings, which reaches every surface from all sides,
-            never occluded: a surface gains albedo x ambient, glossy or not. So it carries no
-            sampling noise and is the same in every renderer. The background of an image, where no
-            body is, is 0.
+            never occluded: a surface gains albedo x ambient, glossy or not. The background of an
+            image, where no body is, is 0.
         area: sampled once for each sample of a pixel, so it has a little sampling noise.
     """
 
@@ -151,16 +150,10 @@ class Renderer(Protocol):
     def render(
         self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
     ) -> list[Image]:
-        """Render one image a camera.
+        """Render one image a camera; the same call gives the same bytes.
 
-        Args:
-            scene: what is there.
-            cameras: where it is seen from.
-            seed: of the sampling pattern; the same call gives the same bytes.
-            geometry: for each camera, whether depth_m, label and cosine are wanted, else inf and 0.
-
-        Raises:
-            RenderError: the renderer failed; the message holds its own.
+        `seed` is that of the sampling pattern; `geometry` has for each camera whether depth_m,
+        label and cosine are wanted, else they are inf and 0. A failure is a RenderError.
         """
 
     def provenance(self) -> dict[str, str]:

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,30 +19,37 @@ import numpy as np
 
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera
-from qs3.meshes.mesh import Mesh
-from qs3.sensors.renderers import blender_devices
 from qs3.sensors.renderers.base import (
-    Body,
     Image,
-    Projector,
     RendererSettings,
     Scene,
     give_memory_back,
     incidence,
 )
-from qs3.sensors.renderers.blender_surfaces import (
+from qs3.sensors.renderers.blender_scene import (
     add_area,
+    add_body,
     add_projector,
     blender_pose,
-    matrix_of,
+    cast_shadow_by_copy,
     show_camera_only,
-    surface,
 )
 
-# How far behind a surface its shadow caster lies, relative to the distance from the projector:
-# 0.2 mm at 2 m, about the gap that Mitsuba leaves.
-_SHADOW_GAP = 1e-4
+_BACKENDS = ("OPTIX", "CUDA")  # OptiX needs a newer driver and is faster
 _BACKGROUND_M = 1e9  # Cycles writes 1e10 m where nothing is hit
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where to render; each makes bytes of its own.
+
+    Attributes:
+        backend: "CPU", or Cycles' name of a GPU interface ("OPTIX", "CUDA").
+        name: what Blender calls the GPU; empty for the CPU, whose kind changes no byte.
+    """
+
+    backend: str = "CPU"
+    name: str = ""
 
 
 class BlenderRenderer:
@@ -64,15 +71,12 @@ class BlenderRenderer:
             device: "auto" (a GPU if Blender lists one for OptiX or CUDA, else the CPU), "cpu"
                 or "gpu". The two make different bytes, so a dataset's recipe says which it was.
             name: what the configuration calls it; taken so that its node can be instantiated.
-
-        Raises:
-            RenderError: Blender or a library that it needs is missing, or the GPU that is wanted.
         """
         self.settings = RendererSettings(samples, threads)
         with _one_cpu() if threads == 1 else nullcontext():
             self._bpy = _import_bpy()
-        listed = {} if device == "cpu" else blender_devices.list_gpus(self._bpy)
-        self.device = blender_devices.choose(device, listed)
+        listed = {} if device == "cpu" else list_gpus(self._bpy)
+        self.device = choose(device, listed)
 
     def render(
         self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
@@ -91,7 +95,7 @@ class BlenderRenderer:
         """Renderer, variant and library versions; see `Renderer.provenance`."""
         found = {
             "renderer": "blender",
-            "variant": self.device.variant,
+            "variant": f"cycles_{self.device.backend.lower()}",
             "bpy": self._bpy.app.version_string,
             "samples": str(self.settings.samples),
         }
@@ -108,13 +112,13 @@ class BlenderRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         target = bpy.context.scene
         _configure(target, self.settings)
-        blender_devices.use(bpy, target.cycles, self.device)
+        _use(bpy, target.cycles, self.device)
         try:
-            bodies = [_add_body(bpy, target, body, scene) for body in scene.bodies]
+            bodies = [add_body(bpy, target, body, scene) for body in scene.bodies]
             lamps = []
             if scene.projector is not None:
                 lamps.append(add_projector(bpy, target, scene.projector))
-                lamps += [_cast_shadow_by_copy(target, thing, scene.projector) for thing in bodies]
+                lamps += [cast_shadow_by_copy(target, thing, scene.projector) for thing in bodies]
             eye = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
             target.collection.objects.link(eye)
             target.camera = eye
@@ -163,6 +167,48 @@ class BlenderRenderer:
             images.append(_image(_read_exr(path), camera))
             path.unlink()
         return images
+
+
+def choose(wanted: str, listed: dict[str, list[str]]) -> Device:
+    """The device for "auto", "cpu" or "gpu"; `listed` are names of GPUs by backend."""
+    assert wanted in ("auto", "cpu", "gpu"), "renderer.device must be auto, cpu or gpu"
+    for backend in _BACKENDS:
+        if wanted != "cpu" and listed.get(backend):
+            # One is used: rendering on several splits the image, and worker processes share one.
+            return Device(backend, listed[backend][0])
+    if wanted == "gpu":
+        raise RenderError("renderer.device=gpu: Blender lists no NVIDIA GPU for OptiX or CUDA")
+    return Device()
+
+
+def list_gpus(bpy: Any) -> dict[str, list[str]]:
+    """Names of the GPUs that Blender can use here, by each backend that it was built with."""
+    built_in = [item[0] for item in _preferences(bpy).get_device_types(bpy.context)]
+    return {
+        backend: [entry.name for entry in _entries(bpy, backend)]
+        for backend in _BACKENDS
+        if backend in built_in
+    }
+
+
+def _use(bpy: Any, cycles: Any, device: Device) -> None:
+    """Set Blender's preferences and a scene's Cycles to `device`."""
+    cycles.device = "CPU" if device.backend == "CPU" else "GPU"
+    if cycles.device == "GPU":
+        _preferences(bpy).compute_device_type = device.backend
+        chosen = next(e for e in _entries(bpy, device.backend) if e.name == device.name)
+        for entry in _preferences(bpy).devices:
+            entry.use = entry.id == chosen.id and entry.type == device.backend
+
+
+def _preferences(bpy: Any) -> Any:
+    return bpy.context.preferences.addons["cycles"].preferences
+
+
+def _entries(bpy: Any, backend: str) -> list[Any]:
+    """Blender's entries of all GPUs of a backend; it lists the CPU with them."""
+    listed = _preferences(bpy).get_devices_for_type(backend)
+    return [entry for entry in listed if entry.type == backend]
 
 
 def _import_bpy() -> Any:
@@ -250,62 +296,6 @@ def _configure(target: Any, settings: RendererSettings) -> None:
     output.file_format = "OPEN_EXR_MULTILAYER"
     output.color_depth = "32"
     output.exr_codec = "NONE"
-
-
-def _add_body(bpy: Any, target: Any, body: Body, scene: Scene) -> Any:
-    """The Blender object of a body of a scene."""
-    faces = body.mesh.faces
-    if scene.area is not None:
-        faces = _without_twins(body.mesh)
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]  # Blender's meshes may not repeat a corner
-    mesh = bpy.data.meshes.new("body")
-    mesh.vertices.add(len(body.mesh.vertices))
-    mesh.vertices.foreach_set("co", body.mesh.vertices.astype(np.float32).ravel())
-    mesh.loops.add(3 * len(faces))
-    mesh.loops.foreach_set("vertex_index", faces.ravel())
-    mesh.polygons.add(len(faces))
-    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
-    mesh.update(calc_edges=True)
-    mesh.shade_flat()
-
-    mesh.materials.append(surface(bpy, body, scene.ambient))
-
-    thing = bpy.data.objects.new("body", mesh)
-    thing.pass_index = body.label
-    thing.visible_diffuse = False  # Cycles follows a diffuse ray to what glows even at 0 bounces
-    thing.visible_glossy = scene.plain
-    target.collection.objects.link(thing)
-    return thing
-
-
-def _without_twins(mesh: Mesh) -> np.ndarray:
-    """Faces [F, 3] without those at the place of another one.
-
-    In the light of an area there is no place for shadow casters (`_cast_shadow_by_copy`) that is
-    behind the surface for all of it, so that twins would shadow each other.
-    """
-    _, place = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True)
-    _, first = np.unique(np.sort(place.ravel()[mesh.faces]), axis=0, return_index=True)
-    return mesh.faces[np.sort(first)]
-
-
-def _cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> Any:
-    """Let an invisible copy cast the shadow, enlarged a little about the projector.
-
-    CAD files often hold a face twice. Cycles starts a shadow ray on the surface itself, so
-    the twins would shadow each other in half of all pixels. The copy lies just behind the
-    surface as the projector sees it, and has the same outline from there.
-    """
-    centre, scale = np.asarray(projector.world_from_projector)[:3, 3], 1 + _SHADOW_GAP
-    matrix = np.diag([scale, scale, scale, 1.0])
-    matrix[:3, 3] = centre * (1 - scale)
-    copy = thing.copy()
-    copy.matrix_world = matrix_of(matrix)
-    copy.visible_camera = False
-    thing.visible_shadow = False
-    target.collection.objects.link(copy)
-    return copy
 
 
 def _aim(target: Any, eye: Any, camera: Camera) -> None:

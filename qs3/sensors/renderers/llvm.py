@@ -17,7 +17,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from qs3.errors import RenderError
@@ -42,19 +42,14 @@ print("{_CHILD_OK}")
 
 @dataclass(frozen=True)
 class Probe:
-    """What can run.
-
-    Attributes:
-        variant: name of a Mitsuba variant.
-        llvm_path: the libLLVM it needs, None for variants that need none.
-    """
+    """A Mitsuba variant that works here, and the libLLVM that it needs, if any."""
 
     variant: str
     llvm_path: str | None = None
 
 
 def libllvm_version(path: str) -> tuple[int, ...]:
-    """Version in the name of a libLLVM file, () if there is none: (19, 1) for libLLVM.so.19.1."""
+    """Version in the name of a file: (19, 1) of libLLVM.so.19.1, () if there is none."""
     name = os.path.basename(os.path.realpath(path))
     match = re.search(r"LLVM-(\d+(?:\.\d+)*)", name) or re.search(r"\.so\.(\d+(?:\.\d+)*)", name)
     return tuple(int(part) for part in match.group(1).split(".")) if match else ()
@@ -74,7 +69,7 @@ def libllvm_candidates() -> list[str]:
 
 
 def cuda_may_work() -> bool:
-    """Whether asking CUDA is worth a child process."""
+    """Whether there is a CUDA library that may see a GPU."""
     hidden = os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1")
     return not hidden and ctypes.util.find_library("cuda") is not None
 
@@ -93,9 +88,9 @@ def find_variant(variant: str = "auto") -> Probe:
         return _inherited() or _remember(_first_that_works())
     if variant.startswith("llvm_"):
         inherited = _inherited()
-        if inherited is not None and inherited.variant == variant:
-            return inherited
-        return _remember(_probe_llvm(variant))
+        if inherited is None or inherited.variant != variant:
+            return _remember(_probe_llvm(variant))
+        return inherited
     if variant.startswith("cuda_"):
         reason = "no libcuda found" if not cuda_may_work() else try_variant(variant, None)
         if reason is not None:
@@ -159,13 +154,9 @@ def _probe_llvm(variant: str) -> Probe:
 
 def _inherited() -> Probe | None:
     """The answer of an earlier probe, of this process or of its parent."""
-    text = os.environ.get(PROBE_VARIABLE)
-    if not text:
+    if not os.environ.get(PROBE_VARIABLE):
         return None
-    try:
-        probe = Probe(**json.loads(text))
-    except (ValueError, TypeError):
-        return None
+    probe = Probe(**json.loads(os.environ[PROBE_VARIABLE]))
     # A library that has gone, or one that the user has chosen since, makes the answer stale.
     if probe.llvm_path is not None:
         chosen = os.environ.get(LIBRARY_VARIABLE) or probe.llvm_path
@@ -175,18 +166,15 @@ def _inherited() -> Probe | None:
 
 
 def _remember(probe: Probe) -> Probe:
-    os.environ[PROBE_VARIABLE] = json.dumps(
-        {"variant": probe.variant, "llvm_path": probe.llvm_path}
-    )
+    os.environ[PROBE_VARIABLE] = json.dumps(asdict(probe))
     return probe
 
 
 WIDTH = 8
 """How many rays the LLVM kernels take at once: the same with and without AVX-512.
 
-By itself Dr.Jit takes 16 where there is AVX-512 and 8 elsewhere. Embree resolves ties by it, of
-faces that lie in each other, as in many CAD meshes: some points in a hundred thousand change. Every
-processor that Mitsuba's wheels run on can do 8; of 16 some would emulate half."""
+Alone Dr.Jit takes 16 where there is AVX-512 and 8 elsewhere. Embree resolves ties by it, of faces
+that lie in each other, as in many CAD meshes: some points in a hundred thousand change."""
 
 # Of drjit 1.5's llvm.h, as its compiler names them.
 _GET_CPU, _GET_FEATURES = "_Z19jit_llvm_target_cpuv", "_Z24jit_llvm_target_featuresv"
@@ -194,10 +182,9 @@ _GET_WIDTH, _SET = "_Z21jit_llvm_vector_widthv", "_Z19jit_llvm_set_targetPKcS0_j
 
 
 def fix_width() -> int:
-    """Take `WIDTH` rays at once from here on; returns how many are taken, 0 where nobody knows.
+    """Let the active LLVM variant take `WIDTH` rays at once; returns how many it takes.
 
-    That is so where this version of Dr.Jit has other calls. An LLVM variant of Mitsuba has to be
-    active.
+    0: not known, because this version of Dr.Jit has other calls.
     """
     import drjit as dr
 

@@ -3,8 +3,8 @@
 With a compiled ("JIT") variant the whole measurement (ray, hit, slide, shadow ray, sum over
 samples) is one kernel of ours, traced once and then used for every scene, window and number
 of samples. Mitsuba's own integrators would be compiled again for each window size, which
-costs more than the render. The scalar variant cannot trace kernels, so there Mitsuba's
-`direct` integrator and its `projector` emitter do the same; a test holds the two together.
+costs more than the render. The scalar variant cannot trace kernels: Mitsuba's `direct` integrator
+and its `projector` emitter do the same there.
 """
 
 from __future__ import annotations
@@ -50,9 +50,6 @@ class MitsubaRenderer:
             threads: 0 is all cores.
             variant: "auto", or a Mitsuba variant ("llvm_ad_mono", "cuda_ad_mono", "scalar_rgb").
             name: what the configuration calls it; taken so that its node can be instantiated.
-
-        Raises:
-            RenderError: the variant cannot run here.
         """
         self.settings = RendererSettings(samples, threads)
         self._probe = llvm.find_variant(variant)
@@ -120,9 +117,7 @@ class MitsubaRenderer:
             if mi.variant() != self.variant:
                 mi.set_variant(self.variant)
         except (ImportError, RuntimeError) as error:
-            raise RenderError(
-                f"Mitsuba variant {self.variant} cannot be loaded: {error}"
-            ) from error
+            raise RenderError(f"Mitsuba cannot load its variant {self.variant}: {error}") from error
         self._width = llvm.fix_width() if self.variant.startswith("llvm_") else None
         threads = self.settings.threads or os.cpu_count() or 1
         if dr.thread_count() != threads:

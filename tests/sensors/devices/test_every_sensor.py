@@ -6,13 +6,12 @@ import pytest
 from qs3.geometry.cameras import look_at
 from qs3.sensors.devices.blensor_kinect import DotMask
 from qs3.sensors.devices.fitted import FittedDepth
-from qs3.sensors.devices.fringe import FringeProjection
+from qs3.sensors.devices.fringe import FringeCode, FringeProjection
 from qs3.sensors.devices.gaussian_time_of_flight import GaussianTimeOfFlight
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.devices.time_of_flight import TimeOfFlight
 from qs3.sensors.matching import StereoBlockMatcher
-from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.visibility import Reason
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer

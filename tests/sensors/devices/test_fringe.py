@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.devices.fringe import FringeProjection
-from qs3.sensors.optics.fringe_code import FringeCode
+from qs3.sensors.devices.fringe import FringeCode, FringeProjection
 from qs3.sensors.optics.visibility import Reason, sample_centres
 from qs3.sensors.renderers.base import Projector, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer

@@ -10,13 +10,10 @@ from qs3.config.hydra import build
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.matching import (
-    STEREOBM_BIAS_PX,
     CensusMatcher,
-    Match,
     ReferenceMatcher,
     StereoBlockMatcher,
 )
-from qs3.sensors.matching.filters import Quantiser, SmallRegions, SpatialFilter
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.sensors.scenery import middle, scan, square
 
@@ -66,38 +63,6 @@ def test_planes_of_a_sensor_with_a_stored_pattern_come_back(renderer, name):
     pooled = np.concatenate(list(depth_errors(sensor, renderer, np.linspace(1.95, 2.05, 8), 0.2)))
     assert abs(np.median(pooled)) < 0.04
     assert np.quantile(np.abs(pooled), 0.68) < 0.15
-
-
-STEPS = [
-    (ReferenceSpeckle(), 8),
-    (ReferenceSpeckle(quantiser=Quantiser(32)), 8),  # finer than the matcher's own
-    (ReferenceSpeckle(quantiser=Quantiser(4)), 4),
-    (ReferenceSpeckle(matcher=ReferenceMatcher(steps_per_px=0)), 0),
-    (ReferenceSpeckle(matcher=ReferenceMatcher(steps_per_px=0), quantiser=Quantiser(32)), 32),
-    (SpeckleStereo(), 16),
-    (SpeckleStereo(quantiser=Quantiser(32)), 16),
-    (SpeckleStereo(quantiser=Quantiser(32), filters=(SmallRegions(0),)), 16),
-    (SpeckleStereo(quantiser=Quantiser(32), filters=(SpatialFilter(max_step_px=99),)), 32),
-    (SpeckleStereo(filters=(SpatialFilter(max_step_px=99),)), 0),
-    (SpeckleStereo(matcher=CensusMatcher(160)), 0),
-    (SpeckleStereo(matcher=CensusMatcher(160), quantiser=Quantiser(32)), 32),
-]
-
-
-@pytest.mark.parametrize(("sensor", "steps"), STEPS)
-def test_the_steps_that_are_stated_are_those_of_the_disparity(sensor, steps):
-    own = getattr(sensor.matcher, "steps_per_px", 0)
-    ramp = np.linspace(30, 34, 8001, dtype=np.float32)[None]
-    found = np.rint(ramp * own) / own if own else ramp  # what such a matcher gives
-    if getattr(sensor.matcher, "remove_bias", False) and own:
-        found = found - np.float32(STEREOBM_BIAS_PX)
-    _, disparity, _ = sensor.depth_of(Match.of(found.astype(np.float32)))
-    gaps = np.diff(np.unique(disparity[np.isfinite(disparity)]))
-    assert sensor.steps_per_px == steps
-    if steps:
-        np.testing.assert_allclose(gaps, 1 / steps, atol=1e-4)
-    else:
-        assert gaps.max() < 0.02
 
 
 @pytest.mark.parametrize("name", ["census", "stereo_bm"])

@@ -8,7 +8,7 @@ import pytest
 
 from qs3.errors import RenderError
 from qs3.sensors.renderers import blender
-from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.blender import BlenderRenderer, Device, choose, list_gpus
 from tests.sensors.renderers.scenes import busy_camera, busy_scene
 
 
@@ -33,7 +33,7 @@ def test_failure_inside_blender_is_reported(monkeypatch):
 
 _ALONE = """
 import json, os, sys
-from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.blender import BlenderRenderer, Device, choose, list_gpus
 from tests.sensors.renderers.scenes import busy_camera, busy_scene
 before = os.sched_getaffinity(0)
 renderer = BlenderRenderer(samples=1, threads=int(sys.argv[1]))
@@ -61,3 +61,34 @@ def test_one_thread_starts_no_helpers():
         assert bound == []  # loading binds the process to one processor, and this is undone
         found.append(count)
     assert found[0] < found[1]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "listed", "expected"),
+    [
+        ("cpu", {"OPTIX": ["A"], "CUDA": ["A"]}, Device()),
+        ("auto", {"OPTIX": ["A"], "CUDA": ["A"]}, Device("OPTIX", "A")),
+        ("auto", {"OPTIX": [], "CUDA": ["B", "C"]}, Device("CUDA", "B")),
+        ("gpu", {"CUDA": ["B"]}, Device("CUDA", "B")),
+        ("auto", {"OPTIX": [], "CUDA": []}, Device()),
+        ("auto", {}, Device()),
+    ],
+)
+def test_choice(wanted, listed, expected):
+    assert choose(wanted, listed) == expected
+
+
+def test_what_blender_really_lists():
+    """With a GPU: it is found, used, and named. Without: the CPU, and an error that says so."""
+    renderer = BlenderRenderer(samples=1)
+    gpus = list_gpus(renderer._bpy)
+    assert set(gpus) == {"OPTIX", "CUDA"}  # what the wheels for Linux and Windows are built with
+    if any(gpus.values()):
+        assert renderer.device == BlenderRenderer(samples=1, device="gpu").device
+        assert renderer.provenance()["device"] == renderer.device.name
+        assert renderer.device.backend != "CPU"
+    else:
+        assert renderer.device == Device()
+        assert "device" not in renderer.provenance()
+        with pytest.raises(RenderError, match="GPU"):
+            BlenderRenderer(samples=1, device="gpu")

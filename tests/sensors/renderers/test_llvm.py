@@ -81,9 +81,8 @@ def test_answer_is_inherited_through_the_environment(tmp_path, monkeypatch):
     assert llvm.find_variant() == llvm.Probe(**answer)
 
 
-@pytest.mark.parametrize("stale", ["not json", '{"variant": "llvm_ad_mono", "llvm_path": "/gone"}'])
-def test_stale_answer_is_not_believed(monkeypatch, stale):
-    monkeypatch.setenv(llvm.PROBE_VARIABLE, stale)
+def test_stale_answer_is_not_believed(monkeypatch):
+    monkeypatch.setenv(llvm.PROBE_VARIABLE, '{"variant": "llvm_ad_mono", "llvm_path": "/gone"}')
     monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "/nowhere/libLLVM.so.19.1")
     _children_run(monkeypatch, f"print('{llvm._CHILD_OK}')")
     assert llvm.find_variant().llvm_path == "/nowhere/libLLVM.so.19.1"

@@ -1,7 +1,4 @@
-"""Materials and lights as Blender's nodes: bodies' surfaces, the projector, the area light.
-
-Every function is handed the bpy module, which `blender` alone imports.
-"""
+"""A scene's bodies and lights in Blender. `bpy` is handed on: `blender` alone imports it."""
 
 from __future__ import annotations
 
@@ -10,14 +7,74 @@ from typing import Any
 
 import numpy as np
 
-from qs3.sensors.renderers.base import AreaLight, Body, Projector
+from qs3.meshes.mesh import Mesh
+from qs3.sensors.renderers.base import AreaLight, Body, Projector, Scene
 
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
 _WATT_PER_RADIANCE = 4 * math.pi**2
+# How far behind a surface its shadow caster lies, relative to the distance from the projector:
+# 0.2 mm at 2 m, about the gap that Mitsuba leaves.
+_SHADOW_GAP = 1e-4
 _GLOW = "ambient"
 
 
-def surface(bpy: Any, body: Body, ambient: float) -> Any:
+def add_body(bpy: Any, target: Any, body: Body, scene: Scene) -> Any:
+    """A body of a scene, with its material."""
+    faces = body.mesh.faces
+    if scene.area is not None:
+        faces = _without_twins(body.mesh)
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]  # Blender's meshes may not repeat a corner
+    mesh = bpy.data.meshes.new("body")
+    mesh.vertices.add(len(body.mesh.vertices))
+    mesh.vertices.foreach_set("co", body.mesh.vertices.astype(np.float32).ravel())
+    mesh.loops.add(3 * len(faces))
+    mesh.loops.foreach_set("vertex_index", faces.ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
+    mesh.update(calc_edges=True)
+    mesh.shade_flat()
+
+    mesh.materials.append(_surface(bpy, body, scene.ambient))
+
+    thing = bpy.data.objects.new("body", mesh)
+    thing.pass_index = body.label
+    thing.visible_diffuse = False  # Cycles follows a diffuse ray to what glows even at 0 bounces
+    thing.visible_glossy = scene.plain
+    target.collection.objects.link(thing)
+    return thing
+
+
+def _without_twins(mesh: Mesh) -> np.ndarray:
+    """Faces [F, 3] without those at the place of another one.
+
+    In the light of an area there is no place for shadow casters (`cast_shadow_by_copy`) that is
+    behind the surface for all of it, so that twins would shadow each other.
+    """
+    _, place = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True)
+    _, first = np.unique(np.sort(place.ravel()[mesh.faces]), axis=0, return_index=True)
+    return mesh.faces[np.sort(first)]
+
+
+def cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> Any:
+    """Let an invisible copy cast the shadow, enlarged a little about the projector.
+
+    CAD files often hold a face twice. Cycles starts a shadow ray on the surface itself, so
+    the twins would shadow each other in half of all pixels. The copy lies just behind the
+    surface as the projector sees it, and has the same outline from there.
+    """
+    centre, scale = np.asarray(projector.world_from_projector)[:3, 3], 1 + _SHADOW_GAP
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[:3, 3] = centre * (1 - scale)
+    copy = thing.copy()
+    copy.matrix_world = _matrix(matrix)
+    copy.visible_camera = False
+    thing.visible_shadow = False
+    target.collection.objects.link(copy)
+    return copy
+
+
+def _surface(bpy: Any, body: Body, ambient: float) -> Any:
     """The material of a body: matt or glossy, with what ambient light adds as its own glow."""
     material = bpy.data.materials.new("diffuse")
     material.use_nodes = True
@@ -66,7 +123,7 @@ def show_camera_only(thing: Any) -> None:
 
 
 def add_projector(bpy: Any, target: Any, projector: Projector) -> Any:
-    """A spot that throws the slide; its Blender object."""
+    """A spot that throws the slide."""
     height, width = projector.slide.shape
     tan_x = projector.tan_half_width
     tan_y = tan_x * height / width
@@ -122,8 +179,8 @@ def add_projector(bpy: Any, target: Any, projector: Projector) -> Any:
     return thing
 
 
-def add_area(bpy: Any, target: Any, area: AreaLight) -> Any:
-    """The square light; its Blender object."""
+def add_area(bpy: Any, target: Any, area: AreaLight) -> None:
+    """The square light."""
     light = bpy.data.lights.new("area", "AREA")
     light.shape, light.size = "SQUARE", area.side_m
     light.energy = area.radiance * math.pi * area.side_m**2  # of a Lambertian source
@@ -132,16 +189,14 @@ def add_area(bpy: Any, target: Any, area: AreaLight) -> Any:
     thing.matrix_world = blender_pose(area.world_from_light)
     thing.visible_camera = False
     target.collection.objects.link(thing)
-    return thing
 
 
 def blender_pose(world_from_local: np.ndarray) -> Any:
     """Pose of a camera or light in Blender: they look along -z with y up."""
-    return matrix_of(np.asarray(world_from_local) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    return _matrix(np.asarray(world_from_local) @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
 
-def matrix_of(matrix: np.ndarray) -> Any:
-    """A matrix in Blender."""
+def _matrix(matrix: np.ndarray) -> Any:
     import mathutils
 
     return mathutils.Matrix(matrix.tolist())
