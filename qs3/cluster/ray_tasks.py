@@ -12,7 +12,7 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -21,7 +21,7 @@ from typing import Annotated, Any
 from annotated_types import Ge, Gt
 
 from qs3.errors import ClusterError, ConfigError
-from qs3.utils.pool import Outcome, Result, Task
+from qs3.utils.pool import Maker, Outcome, Outcomes, Result, Task, Tasks
 from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
@@ -82,11 +82,7 @@ class RayTasks:
         most = has.get("CPU", 0) / self.cpus
         return max(1, int(min(most, has.get("GPU", 0) / self.gpus) if self.gpus else most))
 
-    def run(
-        self,
-        make_worker: Callable[[], Callable[[Task], Result]],
-        tasks: Iterable[tuple[str, Task]],
-    ) -> Iterator[Outcome[Result]]:
+    def run(self, make_worker: Maker[Task, Result], tasks: Tasks[Task]) -> Outcomes[Result]:
         """Do the tasks; as `qs3.utils.pool.Processes.run`.
 
         Raises:

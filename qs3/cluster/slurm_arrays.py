@@ -13,7 +13,7 @@ import pickle
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, islice
@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt
 
-from qs3.utils.pool import Outcome, Result, Task, portable
+from qs3.utils.pool import Maker, Outcome, Outcomes, Result, Task, Tasks, portable
 from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
@@ -66,11 +66,7 @@ class SlurmArrays:
         """How many tasks are done at the same time."""
         return self.jobs
 
-    def run(
-        self,
-        make_worker: Callable[[], Callable[[Task], Result]],
-        tasks: Iterable[tuple[str, Task]],
-    ) -> Iterator[Outcome[Result]]:
+    def run(self, make_worker: Maker[Task, Result], tasks: Tasks[Task]) -> Outcomes[Result]:
         """Do the tasks; as `qs3.utils.pool.Processes.run`."""
         executor = self._executor()
         waiting = iter(tasks)

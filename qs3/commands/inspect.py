@@ -13,7 +13,6 @@ _TURNABLE = 50  # clouds on the page where they can be turned
 
 _Data = Annotated[str | None, "where datasets lie, paths.data_dir of a run"]
 _Domain = Annotated[str, "of conf/domain, or a dataset's folder"]
-_Seed = Annotated[int, Ge(0), "of all random draws"]
 
 
 def inspect(
@@ -21,7 +20,6 @@ def inspect(
     *,
     data_dir: _Data = None,
     sample: Annotated[int, Ge(1), "clouds measured one by one; of more, some are drawn"] = 3000,
-    seed: _Seed = 0,
     out: Annotated[Path | None, "where text and pictures go (out/inspection/NAME)"] = None,
     **overrides: Annotated[str, "of the domain's config, e.g. published.folder=PATH"],
 ) -> None:
@@ -44,7 +42,7 @@ def inspect(
 
     opened = open_named(domain, _with(data_dir, overrides))
     data, split = opened.data, next(iter(opened.data.counts()))
-    clouds = measured(opened, sample, seed)
+    clouds = measured(opened, sample)
     text, heading = domain_text(opened, clouds), f"{opened.label}, {split}"
     folder = make_folder(out or _OUT / _name(opened.name, opened.variant))
     write_text(folder / "inspection.csv", clouds.to_csv(index=False))
@@ -60,7 +58,6 @@ def compare(
     b: Annotated[str, "another one"],
     *,
     data_dir: _Data = None,
-    seed: _Seed = 0,
     out: Annotated[Path | None, "where text and picture go (out/inspection/A-B)"] = None,
     **overrides: Annotated[str, "of both domains' configs; a.KEY and b.KEY of one"],
 ) -> None:
@@ -85,7 +82,7 @@ def compare(
     for side, name, other in (("a.", a, "b."), ("b.", b, "a.")):
         own = {k.removeprefix(side): v for k, v in overrides.items() if not k.startswith(other)}
         sides.append(open_named(name, _with(data_dir, own)))
-    facts = measure(sides[0], sides[1], seed)
+    facts = measure(sides[0], sides[1])
     text, names = pair_text(facts), [_name(one.name, one.variant) for one in sides]
     folder = make_folder(out or _OUT / "-".join(names))
     write_json(folder / "comparison.json", facts)

@@ -32,7 +32,7 @@ from qs3.datasets.object_archive import ADAPT, JUDGE, Archive, is_archive, read_
 from qs3.datasets.pointed import RULES, Caution, point_out
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.geometry.sampling import surface_sample
-from qs3.meshes.io import is_mesh, load_mesh
+from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from qs3.utils.text_table import printable
 
 ALL = "all"
@@ -153,18 +153,22 @@ def clouds(place: Path, up: str, part: str, classes: Sequence[str]) -> Inputs:
         place = place / "points.npy"
     files, root, others = find_files(place)
     left = ", ".join(f"{n} {end or 'without ending'}" for end, n in others.items())
-    units = [partial(_clouds, path, root, up, classes) for path in files]
+    units = [partial(clouds_of, path, root, up, classes) for path in files]
     return Inputs(units, "file", [f"passed over: {left}"] if left else [])
 
 
-def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterator[Sample]:
+def clouds_of(
+    path: Path, root: Path, axis: str, classes: Sequence[str], on_mesh: int = _ON_MESH
+) -> Iterator[Sample]:
+    """The clouds of a file; of a mesh so many samples of its surface: vertices lie at corners."""
     name = printable(path.relative_to(root).as_posix())
     folders = [known_as(part, classes) for part in path.relative_to(root).parts[:-1]]
     folder = next((cls for cls in reversed(folders) if cls), "")
     try:
-        if is_mesh(path):  # its vertices alone lie at corners
+        if is_mesh(path):
             mesh, rng = load_mesh(path), np.random.default_rng(0)
-            found = CloudFile((surface_sample(mesh.vertices, mesh.faces, _ON_MESH, rng),))
+            found = CloudFile((surface_sample(mesh.vertices, mesh.faces, on_mesh, rng),))
+            axis = "z" if path.suffix.lower() in DECLARE_UP else axis
         else:
             found = parse_clouds(path)
     except DataError as error:

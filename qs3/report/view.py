@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from qs3.config.compose import choices
-from qs3.datasets.clouds import SUFFIXES, CloudFile, checked, parse_clouds, with_depth
+from qs3.datasets.clouds import SUFFIXES, checked
 from qs3.datasets.importing import turned
 from qs3.datasets.object_archive import JUDGE, is_archive, read_archive
 from qs3.errors import DataError, MissingDataError
-from qs3.geometry.sampling import surface_sample
-from qs3.inference.inputs import find_files
-from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
+from qs3.inference.inputs import clouds_of, find_files
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.datasets import chosen, open_named, part_of
 from qs3.report.run_files import is_run, read_run
@@ -24,7 +22,6 @@ from qs3.report.sheets import drawn
 from qs3.report.viewer import Part, Shown, page, points_each
 from qs3.store.meta import is_finished
 from qs3.utils.progress import progress_bar
-from qs3.utils.text_table import printable
 
 
 class Wanted(NamedTuple):
@@ -90,46 +87,21 @@ def _files(place: Path, most: int, wanted: Wanted) -> Part:
     few = drawn(np.flatnonzero([wanted.match in name for name in names]), most)
     shown: list[Shown] = []
     failed: list[str] = []
+    each = points_each(len(few), wanted.points)
     with progress_bar("files", total=len(few)) as advance:
         for i in few:
-            for one in _of_file(files[i], printable(names[i]), wanted, len(few)):
-                if isinstance(one, Shown):
-                    shown.append(one)
-                else:
-                    failed.append(one)
+            for one in clouds_of(files[i], root, wanted.up, (), each):
+                try:
+                    if one.cloud is None:
+                        raise DataError(one.reason)
+                    cloud = turned(checked(one.cloud, one.name), one.axis)
+                except DataError as error:
+                    failed.append(f"{one.name}: {error}")
+                    continue
+                label = one.label or Path(one.name).parent.name
+                lost = f"{one.dropped} points without depth left out" if one.dropped else ""
+                shown.append(Shown(one.name, cloud, label=label, note=lost))
             advance()
     about = place.name if place.is_file() else f"{len(few)} of {len(files)} files in {place.name}"
     kept = [shown[i] for i in drawn(np.arange(len(shown)), most)]
     return Part(kept, f"{about}, {len(kept)} of {len(shown)} clouds", failed=failed)
-
-
-def _of_file(path: Path, name: str, wanted: Wanted, files: int) -> Iterator[Shown | str]:
-    """A file's clouds, of a mesh samples of its surface; or why one cannot be shown.
-
-    Their class is that of the file, else the name of the file's folder.
-    """
-    note, up = "", wanted.up
-    try:
-        if is_mesh(path):
-            mesh, count = load_mesh(path), points_each(files, wanted.points)
-            cloud = surface_sample(mesh.vertices, mesh.faces, count, np.random.default_rng(0))
-            found = CloudFile((cloud,))
-            note = f"samples of {len(mesh.faces)} faces"
-            up = "z" if path.suffix.lower() in DECLARE_UP else up
-        else:
-            found = parse_clouds(path)
-    except DataError as error:
-        yield f"{name}: {error}"
-        return
-    for i, given in enumerate(found.clouds):
-        own = f"{name}[{i}]" if found.many else name
-        label = Path(name).parent.name if found.labels is None else found.labels[i]
-        words = label.decode(errors="replace") if isinstance(label, bytes) else str(label)
-        try:
-            seen, dropped = with_depth(given, own)
-            cloud = turned(checked(seen, own), up)
-        except DataError as error:
-            yield f"{own}: {error}"
-            continue
-        lost = f"{dropped} points without depth left out" if dropped else note
-        yield Shown(own, cloud, label=printable(words), note=lost)

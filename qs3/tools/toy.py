@@ -28,6 +28,7 @@ SHAPES = {
 """Half axes of the ellipsoid that each class is."""
 
 POINTS = 64
+Counts = tuple[int, ...]
 _TRAIN, _TEST = (120, 30, 60, 30), (80, 20, 40, 20)  # of the target, by class
 _NOISE = {"toy_source": 0.02, "toy_target": 0.12}  # of each coordinate, by domain
 
@@ -49,12 +50,7 @@ class ToyNet(nn.Module):
 
 
 def write_toy(root: str | Path, seed: int = 0) -> tuple[PointSet, PointSet]:
-    """Write both domains below `root`.
-
-    Returns:
-        The source: 30 clouds a class for training, 10 for tests, hardly any noise. The target:
-        noisy, and its classes are not equally frequent.
-    """
+    """Write a source with hardly any noise, and a noisy target of unequally frequent classes."""
     source = _write(Path(root), "toy_source", (30,) * 4, (10,) * 4, seed)
     return source, _write(Path(root), "toy_target", _TRAIN, _TEST, seed + 1)
 
@@ -62,44 +58,29 @@ def write_toy(root: str | Path, seed: int = 0) -> tuple[PointSet, PointSet]:
 def toy_overrides(root: str | Path) -> list[str]:
     """What makes a run of train.py one on the toy, in `root`: QBST with three short rounds."""
     root = Path(root).absolute()
-    words = ["experiment=quickstart", "experiment_name=toy", "method=source_only", "num_classes=4"]
+    domains = []
     for role in ("source", "target"):
-        of_role = {
-            "name": f"toy_{role}",
-            "title": f"toy_{role}",
-            "symbol": role[0].upper(),
-            "classes": f"[{','.join(SHAPES)}]",
-            "published": "null",
-            "simulated": "true",
-        }
-        words.append(f"domain@data.{role}=own")
-        words += [f"data.{role}.{key}={value}" for key, value in of_role.items()]
-        words.append(override(f"data.{role}.path", root / "data" / f"toy_{role}"))
+        own = f"name=toy_{role} title=toy_{role} symbol={role[0].upper()} published=null"
+        own += f" simulated=true classes=[{','.join(SHAPES)}]"
+        domains += [f"domain@data.{role}=own", *(f"data.{role}.{word}" for word in own.split())]
+        domains.append(override(f"data.{role}.path", root / "data" / f"toy_{role}"))
     return [
-        *words,
+        *("experiment=quickstart", "experiment_name=toy", "method=source_only", "num_classes=4"),
+        *domains,
         "model=pointnet",
         "model._target_=qs3.tools.toy.ToyNet",
         *(f"~model.{key}" for key in ("variant", "norm", "dropout")),
         f"data.points={POINTS}",
-        "data.fps_starts=1",
-        "protocol.epochs=12",
-        "protocol.optimizer.lr=0.01",
-        "selftraining.rounds=3",
-        "selftraining.epochs=10",
-        "selftraining.theta=0.7",
-        "selftraining.epsilon=0.05",
-        "trainer.threads=1",
-        "logger=csv",
-        "report.pictures=false",
+        *("data.fps_starts=1", "protocol.epochs=12", "protocol.optimizer.lr=0.01"),
+        *("selftraining.rounds=3", "selftraining.epochs=10", "selftraining.theta=0.7"),
+        *("selftraining.epsilon=0.05", "trainer.threads=1", "logger=csv", "report.pictures=false"),
         override("paths.data_dir", root / "data"),
         override("paths.log_dir", root / "logs"),
         override("paths.warmup_dir", root / "warmups"),
     ]
 
 
-def _write(
-    root: Path, name: str, train: tuple[int, ...], test: tuple[int, ...], seed: int
-) -> PointSet:
+def _write(root: Path, name: str, train: Counts, test: Counts, seed: int) -> PointSet:
     rng, clouds, rows = np.random.default_rng(seed), [], []
     for split, counts in (("train", train), ("test", test)):
         for (cls, half_axes), count in zip(SHAPES.items(), counts, strict=True):

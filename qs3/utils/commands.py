@@ -187,10 +187,10 @@ def _summary(found: str | Commands) -> str:
 
 
 def _split(value: str, hint: Any) -> Any:
-    """A list of the words between commas where the type is a sequence."""
+    """A list of the words between commas where the type is a tuple."""
     if value == "null":
         return None
-    if not {tuple, list} & {get_origin(kind) for kind in _kinds(hint)}:
+    if tuple not in map(get_origin, _kinds(hint)):
         return value
     return [part.strip() for part in value.strip("[]").split(",") if part.strip()]
 
@@ -210,7 +210,7 @@ def _word(hint: Any) -> str:
     for kind in _kinds(hint):
         if get_origin(kind) is Literal:
             words.append("|".join(map(str, get_args(kind))))
-        elif get_origin(kind) in (tuple, list):
+        elif get_origin(kind) is tuple:
             words.append(f"{_word(get_args(kind)[0])},...")
         else:
             words.append(_WORDS.get(kind, "TEXT"))
@@ -245,8 +245,6 @@ def _page(name: str, summary: str, rows: Sequence[tuple[str, str]], about: str =
     column = min(max((len(left) for left, _ in rows), default=0), 24) + 4
     lines = [f"{name}: {summary}" if summary else name, ""]
     for left, right in rows:
-        begin = (
-            f"  {left}".ljust(column) if len(left) + 4 <= column else f"  {left}\n{' ' * column}"
-        )
-        lines.append(begin + f"\n{' ' * column}".join(textwrap.wrap(right, _WIDTH - column)))
+        begin, indent = f"  {left}  ".ljust(column), " " * column
+        lines.append(textwrap.fill(right, _WIDTH, initial_indent=begin, subsequent_indent=indent))
     return "\n".join([*lines, *(["", about] if about else [])])

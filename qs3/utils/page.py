@@ -21,10 +21,7 @@ _TEMPLATES = Path(__file__).with_name("templates")
 
 
 def render(template: str, **values: Any) -> str:
-    """A page or a text from a template, such as "run.html"; values are never taken for HTML.
-
-    A page's policy lets a browser run the viewer's script alone, and load nothing.
-    """
+    """A page or a text from a template, such as "run.html"; values are never taken for HTML."""
     return _environment().get_template(f"{template}.j2").render(**values)
 
 

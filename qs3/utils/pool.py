@@ -1,7 +1,7 @@
 """Tasks in several processes; one that kills its process costs only itself.
 
-Each worker has a pipe of its own and one task at a time. A process that is killed in the middle
-of a message therefore spoils nobody else's, and which task it had is known.
+Each worker has its own pipe and one task at a time: a process that is killed in the middle of a
+message spoils no other one, and which task it had is known.
 """
 
 from __future__ import annotations
@@ -37,6 +37,11 @@ class Outcome(Generic[Result]):
     died: bool = False
 
 
+Maker = Callable[[], Callable[[Task], Result]]
+Tasks = Iterable[tuple[str, Task]]
+Outcomes = Iterator[Outcome[Result]]
+
+
 class Pool(Protocol):
     """Whoever does named tasks: processes of this machine, or `qs3.cluster`."""
 
@@ -52,11 +57,7 @@ class Pool(Protocol):
     def elsewhere(self) -> bool:
         """Whether workers may be on machines with other software."""
 
-    def run(
-        self,
-        make_worker: Callable[[], Callable[[Task], Result]],
-        tasks: Iterable[tuple[str, Task]],
-    ) -> Iterator[Outcome[Result]]:
+    def run(self, make_worker: Maker[Task, Result], tasks: Tasks[Task]) -> Outcomes[Result]:
         """Do the tasks; see `Processes.run`."""
 
 
@@ -83,11 +84,7 @@ class Processes:
         """As many as there are workers."""
         return self.workers
 
-    def run(
-        self,
-        make_worker: Callable[[], Callable[[Task], Result]],
-        tasks: Iterable[tuple[str, Task]],
-    ) -> Iterator[Outcome[Result]]:
+    def run(self, make_worker: Maker[Task, Result], tasks: Tasks[Task]) -> Outcomes[Result]:
         """Do the tasks; yields one outcome a task, in the order in which they are done.
 
         What a worker raises ends everything; failures that must not are results.
@@ -104,11 +101,7 @@ class Processes:
         for name, task in tasks:
             yield Outcome(name, work(task))
 
-    def _run(
-        self,
-        make_worker: Callable[[], Callable[[Task], Result]],
-        tasks: Iterable[tuple[str, Task]],
-    ) -> Iterator[Outcome[Result]]:
+    def _run(self, make_worker: Maker[Task, Result], tasks: Tasks[Task]) -> Outcomes[Result]:
         waiting = iter(tasks)
         crew: list[_Worker] = []
         suspects: list[tuple[str, Any]] = []
