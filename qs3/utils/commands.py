@@ -190,7 +190,7 @@ def _split(value: str, hint: Any) -> Any:
     """A list of the words between commas where the type is a tuple."""
     if value == "null":
         return None
-    if tuple not in map(get_origin, _kinds(hint)):
+    if tuple not in [get_origin(kind) for kind in _kinds(hint)]:
         return value
     return [part.strip() for part in value.strip("[]").split(",") if part.strip()]
 
