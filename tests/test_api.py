@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 import qs3
 from qs3.api import generate, train
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.report.run_files import read_run
+from qs3.report.run_page import read_run
 from qs3.runs.metrics import read_metrics
 from qs3.tools.toy import SHAPES, ToyNet, toy_overrides, write_toy
 

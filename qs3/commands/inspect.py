@@ -34,8 +34,7 @@ def inspect(
         qs3 inspect data/specklenet10 variant=points_clean
     """
     from qs3.report.datasets import chosen, open_named, part_of
-    from qs3.report.inspection import domain_text, measured
-    from qs3.report.sheets import class_sheet
+    from qs3.report.inspection import class_sheet, domain_text, measured
     from qs3.report.viewer import page
     from qs3.utils.files import make_folder, write_text
     from qs3.utils.pictures import save_png
@@ -48,7 +47,7 @@ def inspect(
     write_text(folder / "inspection.csv", clouds.to_csv(index=False))
     write_text(folder / "inspection.txt", text + "\n")
     save_png(class_sheet(data, split, heading), folder / "clouds.png", colours=256)
-    part = part_of(opened, chosen(data, _TURNABLE), False)
+    part = part_of(opened, chosen(data, _TURNABLE))
     write_text(folder / "clouds.html", page(opened.label, [part]))
     print(f"{text}\n\nsaved text, table, pictures and clouds.html in {folder}")
 
@@ -63,9 +62,9 @@ def compare(
 ) -> None:
     """Two datasets and the gap between them.
 
-    What they are made of, class frequencies, spacing, density, coverage, distance to the true
-    surface and how much of it was measured (of generated datasets), how well clouds tell their
-    domain; one object of each class from both, as a picture.
+    What they are made of, class frequencies, spacing, density, coverage, distance to the clean twin
+    and how much of it was measured (of generated datasets); one object of each class from both, as
+    a picture.
 
     Example:
         qs3 compare specklenet10 specklenet10 a.variant=points_clean
@@ -73,8 +72,7 @@ def compare(
     """
     from qs3.report.datasets import open_named
     from qs3.report.inspection import compare as measure
-    from qs3.report.inspection import pair_text
-    from qs3.report.sheets import scan_picture
+    from qs3.report.inspection import pair_text, scan_picture
     from qs3.utils.files import make_folder, write_json, write_text
     from qs3.utils.pictures import save_png
 
@@ -100,9 +98,7 @@ def view(
     out: Annotated[Path, "the page"] = Path("view.html"),
     clouds: Annotated[int, Interval(ge=1, le=500), "at most so many"] = 50,
     points: Annotated[int | None, Interval(ge=1, le=200_000), "of each cloud"] = None,
-    colour: Annotated[
-        Literal["", "height", "view", "residual", "class", "confidence"], "shown first"
-    ] = "",
+    colour: Annotated[Literal["", "height", "class", "confidence"], "shown first"] = "",
     match: Annotated[str, "only clouds with this in their names"] = "",
     up: Annotated[Literal["x", "y", "z", "-x", "-y", "-z"], "of files: what points up"] = "z",
     variant: Annotated[str, "of a dataset, such as points_clean"] = "",
@@ -116,14 +112,13 @@ def view(
     points=, some are drawn at random, always the same ones.
 
     The page is one file that needs neither a network nor qs3. Drag to turn, click to enlarge, find
-    by words such as "chair" or "wrong". Colours: height; the view that saw a point; residual, the
-    distance of a point to the true surface, where the dataset knows it; class; confidence.
+    by words such as "chair" or "wrong". Colours: height, class, confidence.
 
     A damaged file is named and the others go on; the exit status is then 1.
 
     Example:
         qs3 view chair.ply other/chair.ply points=20000
-        qs3 view data/specklenet10 match=chair colour=residual
+        qs3 view data/specklenet10 match=chair colour=class
         qs3 view logs/qs3_s2d/seed0-5f0c2a71 out=errors.html
     """
     from qs3.report.view import Wanted

@@ -13,7 +13,7 @@ from annotated_types import Ge
 from qs3.errors import ConfigError
 
 if TYPE_CHECKING:
-    from qs3.report.tables.table import Table
+    from qs3.report.table import Table
 
 _Out = Annotated[str | None, "where the files go (default LOG_DIR/tables)"]
 _Seeds = Annotated[tuple[Annotated[int, Ge(0)], ...], "of each cell (default: the table's)"]
@@ -35,7 +35,7 @@ def _built(
     import shlex
 
     from qs3.config.compose import override
-    from qs3.report.tables.table import build_table
+    from qs3.report.table import build_table
 
     extra = shlex.split(overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
@@ -74,7 +74,7 @@ def _words(settings: Mapping[str, str], begin: str) -> list[str]:
 
 @_of_table
 def table(build: Callable[..., Table], *, out: _Out = None) -> None:
-    """Print a table of runs, and save it as .md, .csv and .tex.
+    """Print a table of runs, and save it as .md and .csv.
 
     `qs3 report table=NAME` is short for `qs3 report table table=NAME`. The saved files also have
     what the runs were measured on, and the commands that fill empty cells.
@@ -83,11 +83,10 @@ def table(build: Callable[..., Table], *, out: _Out = None) -> None:
         qs3 report table=headline kept=docs/results/headline.csv.gz
         qs3 report table=uda target=kinectsim10 overrides="trainer=gpu data.points=512"
     """
-    from qs3.report.tables.formats import csv_text, latex, markdown, save, text
+    from qs3.report.formats import csv_text, markdown, save, text
 
     found = build()
-    texts = {".md": markdown(found), ".csv": csv_text(found), ".tex": latex(found)}
-    said = save(_place(found, out), texts)
+    said = save(_place(found, out), {".md": markdown(found), ".csv": csv_text(found)})
     print(text(found), f"runs lie in {found.log_dir}; {said}", sep="\n")
 
 
@@ -107,7 +106,7 @@ def train(
         qs3 report train table=self_training rows=qbst columns="S -> D" seeds=0
         qs3 report train table=uda launcher=slurm jobs=16 hydra.launcher.partition=gpu
     """
-    from qs3.report.tables.running import launch, missing
+    from qs3.report.running import launch, missing
 
     more, found = _words(settings, "hydra.launcher."), build()
     todo = missing(found, seeds, rows)
@@ -126,8 +125,8 @@ def keep(build: Callable[..., Table], *, into: Annotated[Path, "the file, NAME.c
     Example:
         qs3 report keep table=real into=docs/results/real.csv.gz
     """
-    from qs3.report.tables.results import write_kept
-    from qs3.report.tables.table import kept_lines
+    from qs3.report.results import write_kept
+    from qs3.report.table import kept_lines
 
     found = build()
     lines = kept_lines(found)
@@ -152,8 +151,8 @@ def compare(
         qs3 report compare table=cad10 base="source only" kept=docs/results/cad10.csv.gz
         qs3 report compare table=headline kept=docs/results/headline.csv.gz
     """
-    from qs3.report.tables.comparison import against, effects, row_of, text
-    from qs3.report.tables.formats import save
+    from qs3.report.comparison import against, effects, row_of, text
+    from qs3.report.formats import save
 
     found = build()
     row = row_of(found, base) if base else ""
@@ -217,9 +216,9 @@ def leaderboard(
         qs3 leaderboard method=my_method.py
         qs3 leaderboard method=my_method.py method.weight=0.5 columns="S -> K"
     """
+    from qs3.report.formats import csv_text, save
     from qs3.report.leaderboard import check_row, first_row, own_row, page
-    from qs3.report.tables.formats import csv_text, latex, save
-    from qs3.report.tables.running import launch, missing
+    from qs3.report.running import launch, missing
 
     row = own_row(method, name, selftraining, _words(settings, "method."))
     check_row(build(rows=[row], runs=False), row["name"])
@@ -230,7 +229,7 @@ def leaderboard(
     found = first_row(build(rows=[row]), row["name"])
     text = page(found, row["name"])
     place = _place(found, out, "".join(c if c.isalnum() else "-" for c in row["name"]))
-    said = save(place, {".md": text, ".csv": csv_text(found), ".tex": latex(found)})
+    said = save(place, {".md": text, ".csv": csv_text(found)})
     print(text, said, sep="\n")
     return status
 

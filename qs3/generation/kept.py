@@ -25,7 +25,7 @@ from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.optics.visibility import Reason
 from qs3.utils.files import remove_leftovers, write_bytes
-from qs3.utils.pictures import cloud_image, save_png, sheet, value_image
+from qs3.utils.pictures import Image, cloud_image, save_png, sheet, value_image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -232,9 +232,9 @@ def _range(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def view_picture(frame: DepthFrame) -> Figure:
-    """Infrared image, disparity, depth and reasons side by side."""
-    titles, images = [], []
+def view_images(frame: DepthFrame) -> list[tuple[str, Image]]:
+    """Infrared image, disparity, depth and reasons of a view, with their titles."""
+    found = []
     for name, values, colours, unit in (
         ("infrared", photograph(frame.images), "gray", ""),
         ("disparity", frame.images.get("disparity"), "viridis", "px"),
@@ -242,16 +242,21 @@ def view_picture(frame: DepthFrame) -> Figure:
     ):
         if values is not None:
             low, high = _range(values)
-            titles.append(f"{name}, {low:.2f} to {high:.2f} {unit}")
-            images.append(value_image(values, low, high, colours))
+            title = f"{name}, {low:.2f} to {high:.2f} {unit}"
+            found.append((title, value_image(values, low, high, colours)))
     reasons = np.zeros((*frame.reason.shape, 3), dtype=np.uint8)
     shares = []
     for reason, bgr in REASON_COLOURS.items():
         reasons[frame.reason == reason] = bgr[::-1]
         if share := float((frame.reason == reason).mean()):
             shares.append(f"{reason.name.lower()} {share:.1%}")
-    titles.append("why there is a depth or none:\n" + "\n".join(shares))
-    return sheet([*images, reasons], titles, columns=len(titles), panel_in=_PANEL_IN)
+    return [*found, ("why there is a depth or none:\n" + "\n".join(shares), reasons)]
+
+
+def view_picture(frame: DepthFrame) -> Figure:
+    """The images of a view side by side."""
+    titles, images = zip(*view_images(frame), strict=True)
+    return sheet(images, titles, columns=len(titles), panel_in=_PANEL_IN)
 
 
 def _safe(part: str) -> str:

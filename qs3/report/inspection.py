@@ -1,11 +1,11 @@
-"""What datasets are like: counts, sizes, spacing, density, coverage, copies, and the gap of two."""
+"""What datasets are like: counts, sizes, spacing, coverage, copies, pictures, the gap of two."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -13,13 +13,17 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from qs3.errors import ConfigError
-from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample, unit_ball
-from qs3.report.datasets import Opened, distance_to_mesh, surfaces_of
-from qs3.report.sheets import drawn
+from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
+from qs3.report.datasets import Opened
+from qs3.report.viewer import drawn
 from qs3.store.meta import ManifestRow
-from qs3.store.store import PointSet
+from qs3.store.store import PointSet, open_pointset
 from qs3.utils.page import render
+from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, turn_deg
 from qs3.utils.progress import progress_bar
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NET_POINTS = 1024
 """Two datasets are compared with so many points a cloud, by farthest point sampling."""
@@ -30,22 +34,14 @@ WITHIN = 0.1
 AZIMUTHS, RINGS = 12, 6
 """Directions are counted in 12 x 6 bins of equal solid angle."""
 
-VOXEL = 0.125
-"""Side of a voxel in units of the unit ball."""
-
 _OUTLIER = 5.0  # a point is lonely if its 4th neighbour is so many times the cloud's median away
 _ODD_SIZE = 5.0  # an object's size is odd so many robust standard deviations from its class
 _USUAL = 8  # clouds of a class, to know what is usual: of three one is soon far from the others
-_FEATURED = 60  # clouds a class that are compared
-_SURFACES = 20  # objects a class whose distance to the surface is measured,
-_SURFACE_POINTS = 512  # with so many points of each, at random
-_SLICES, _SLICED_POINTS = 10, 512
+_COMPARED = 60  # clouds a class
+_SHEET, _ROW = 60, 6  # clouds of a class sheet, and in its rows
+_SIDE_PX, _POINTS = 376, 1024  # of a picture on a sheet
 _COLUMNS = ("sub", "tier", "sensor", "vertical")  # of an imported dataset's manifest
-_SPACED = (
-    *("nn_low", "nn_median", "nn_high", "nn_variation", "voxel_variation", "lonely"),
-    *("directions", "below"),
-)
-_DENSITY = ("nn_median", "nn_variation", "voxel_variation", "directions", "below", "lonely")
+_SPACED = ("nn_median", "nn_variation", "lonely", "directions", "below")
 
 
 def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
@@ -55,10 +51,8 @@ def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
         x, y, z, largest: sides of its box, as given; floor, off_centre: its lowest z, and how far
             its centroid is off the origin; radius: its largest distance from the centroid.
         copies: share of points that repeat an earlier one exactly; left out of all below.
-        nn_median, nn_low, nn_high: distance to the nearest other point in the unit ball: median,
-            5 and 95 %; nn_stored: the median as given.
-        nn_variation: its standard deviation over its mean.
-        voxel_variation: the same of the points in an occupied voxel.
+        nn_median: median distance to the nearest other point, in the unit ball.
+        nn_variation: the distances' standard deviation over their mean.
         lonely: share of points whose 4th neighbour is over five times as far as the median's.
         directions: share of 72 equal bins of direction, from the centroid, with a point in it.
         below: the same for the lowest third of the bins (what a scan from above misses).
@@ -74,19 +68,12 @@ def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
         "copies": 1 - len(distinct) / len(cloud),
     }
     if len(distinct) < 5:
-        return {**found, **dict.fromkeys(_SPACED, 0.0), "nn_stored": 0.0}
+        return {**found, **dict.fromkeys(_SPACED, 0.0)}
     ball = unit_ball(distinct)
     nearest, fourth = cKDTree(ball).query(ball, k=[2, 5])[0].T
-    _, inside = np.unique(np.floor(ball / VOXEL).astype(int), axis=0, return_counts=True)
-    values = (
-        *np.percentile(nearest, [5, 50, 95]),
-        nearest.std() / nearest.mean(),
-        inside.std() / inside.mean(),
-        (fourth > _OUTLIER * np.median(fourth)).mean(),
-        *coverage(ball),
-    )
-    found |= dict(zip(_SPACED, map(float, values), strict=True))
-    return found | {"nn_stored": found["nn_median"] * found["radius"]}
+    lonely = fourth > _OUTLIER * np.median(fourth)
+    spaced = (np.median(nearest), nearest.std() / nearest.mean(), lonely.mean(), *coverage(ball))
+    return found | dict(zip(_SPACED, map(float, spaced), strict=True))
 
 
 def coverage(ball: Float[np.ndarray, "p 3"]) -> tuple[float, float]:
@@ -193,10 +180,8 @@ def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
         rows[cls] = {
             **{side: f"{m[side]:.3g}" for side in "xyz"},
             "largest side": f"{of['largest'].min():.3g}..{of['largest'].max():.3g}",
-            "spacing": f"{m['nn_low']:.3f} {m['nn_median']:.3f} {m['nn_high']:.3f}",
-            "as stored": f"{m['nn_stored']:.3g}",
+            "spacing": f"{m['nn_median']:.3f}",
             "cv": f"{m['nn_variation']:.2f}",
-            "cv voxel": f"{m['voxel_variation']:.2f}",
             "seen": f"{m['directions']:.0%}",
             "below": f"{m['below']:.0%}",
             "lonely": f"{of['lonely'].mean():.2%}",
@@ -205,11 +190,7 @@ def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
 
 
 def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
-    """The gap between two datasets.
-
-    Args:
-        a, b: the datasets.
-        seed: of all draws.
+    """The gap between two datasets, by up to 60 clouds a class, drawn with `seed`.
 
     Raises:
         ConfigError: they have no class in common.
@@ -219,16 +200,16 @@ def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
     if not common:
         raise ConfigError(f"{a.label} and {b.label} have no class with labels in common")
     count = min(NET_POINTS, *(one.data.points.shape[1] for one in both))
-    clouds, labels, values, surfaces = [], [], [], []
+    shares = [
+        pd.Series({cls: len(one.data.members(cls)) for cls in one.data.classes}) for one in both
+    ]
+    prior = pd.DataFrame(dict(zip("AB", shares, strict=True))).fillna(0)
+    clouds = []
     for one in both:
-        chosen = _of_each(one, common, _FEATURED, seed)
-        labels.append(np.repeat(np.arange(len(common)), [len(of) for of in chosen]))
-        clouds.append([_sampled(one.data.points[i], count) for i in np.concatenate(chosen)])
-        values.append(pd.DataFrame([one_cloud(cloud) for cloud in clouds[-1]]))
-        surfaces.append(surface(one, common, seed))
-    shares = [pd.Series({cls: len(one.data.members(cls)) for cls in one.data.classes})
-              for one in both]  # fmt: skip
-    prior = pd.DataFrame({"A": shares[0], "B": shares[1]}).fillna(0)
+        positions = _of_each(one, common, seed)
+        seen = pd.DataFrame([one_cloud(_sampled(one.data.points[i], count)) for i in positions])
+        means = seen[["copies", "lonely"]].mean()
+        clouds.append(seen.median().to_dict() | means.to_dict() | surface(one, positions))
     return {
         "a": a.label,
         "b": b.label,
@@ -237,130 +218,27 @@ def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
         "points": count,
         "seed": seed,
         "prior": (prior / prior.sum()).to_dict("index"),
-        "cloud": [of.median().to_dict() | of[["copies", "lonely"]].mean().to_dict()
-                  for of in values],
-        "surface": surfaces,
-        "told_apart": _told_apart(clouds, labels, values, len(common)),
-    }  # fmt: skip
-
-
-def surface(opened: Opened, classes: Sequence[str], seed: int = 0) -> dict[str, Any]:
-    """How far points lie from the true surface and how much of it was measured.
-
-    The truth is the placed mesh; where that is not known, the clean twin, whose own spacing is
-    then part of every distance; where there is none, the truth is unknown. Distances are as
-    stored, and in units of the unit ball; the measured share is the mean over the classes.
-    """
-    surfaces = surfaces_of(opened.data.meta)
-    twin = opened.twin if surfaces is None else None
-    rng = np.random.default_rng([seed, 1])
-    kept = opened.kept
-    off, relative, shares = [], [], []
-    for chosen in _of_each(opened, classes, _SURFACES, seed):
-        seen = []
-        for i in chosen:
-            cloud = np.asarray(opened.data.points[i], dtype=np.float64)
-            mesh = None if surfaces is None else surfaces.mesh(kept[i])
-            if mesh is not None:
-                some = rng.permutation(len(cloud))[:_SURFACE_POINTS]
-                distance = distance_to_mesh(cloud[some], mesh)
-                truth = surface_sample(mesh.vertices, mesh.faces, 4096, rng)
-            elif twin is not None:
-                truth = np.asarray(twin.points[i], dtype=np.float64)
-                distance = cKDTree(truth).query(cloud)[0]
-            else:
-                continue
-            radius = float(np.linalg.norm(truth - truth.mean(axis=0), axis=1).max()) or 1.0
-            off.append(distance)
-            relative.append(distance / radius)
-            seen.append((cKDTree(cloud).query(truth)[0] < WITHIN * radius).mean())
-        shares += [np.mean(seen)] if seen else []
-    if not off:
-        return {"truth": "unknown"}
-    median, p95 = np.percentile([np.concatenate(off), np.concatenate(relative)], [50, 95], axis=1)
-    return {
-        "truth": "clean twin" if surfaces is None else "mesh",
-        "median": float(median[0]),
-        "p95": float(p95[0]),
-        "median_ball": float(median[1]),
-        "p95_ball": float(p95[1]),
-        "measured": float(np.mean(shares)),
+        "cloud": clouds,
     }
 
 
-def slices(cloud: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " f"]:
-    """What describes the shape of a cloud however it is turned about z.
+def surface(opened: Opened, positions: Sequence[int]) -> dict[str, float]:
+    """How far points lie from the clean twin's, and the share of the twin's that has one near.
 
-    Of each of ten slices of equal height: the share of points (square root), their mean distance
-    from the vertical axis, their spread along and across (standard deviations), how far their
-    centre is off the axis; and of the whole the height and the two sides of the base. In units of
-    the unit ball; at most 512 points are taken, evenly.
+    In units of the unit ball; the twin's own spacing is part of every distance. {} without twins.
     """
-    step = max(1, len(cloud) // _SLICED_POINTS)
-    ball = unit_ball(np.asarray(cloud, dtype=np.float64)[::step][:_SLICED_POINTS])
-    low, size = ball.min(axis=0), np.ptp(ball, axis=0)
-    height = (ball[:, 2] - low[2]) / max(size[2], 1e-9)
-    place = np.minimum((height * _SLICES).astype(int), _SLICES - 1)
-    count = np.bincount(place, minlength=_SLICES)
-
-    def mean(of: np.ndarray) -> np.ndarray:
-        return np.bincount(place, of, minlength=_SLICES) / np.maximum(count, 1)
-
-    u, v = (ball - low - size / 2)[:, :2].T
-    mean_u, mean_v = mean(u), mean(v)
-    uu, vv = mean(u * u) - mean_u**2, mean(v * v) - mean_v**2
-    uv = mean(u * v) - mean_u * mean_v
-    middle, spread = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv**2)
-    parts = (
-        np.sqrt(count / len(ball)),
-        mean(np.hypot(u, v)),
-        np.sqrt(np.maximum(middle + spread, 0)),
-        np.sqrt(np.maximum(middle - spread, 0)),
-        np.hypot(mean_u, mean_v),
-        size[2:],
-        np.sort(size[:2]),
-    )
-    return np.concatenate(parts)
-
-
-def own_neighbours(a: Float[np.ndarray, "n f"], b: Float[np.ndarray, "n f"]) -> float:
-    """Share of clouds whose nearest other cloud, by standardised features, is of its own set.
-
-    0.5: the sets cannot be told apart, 1: two worlds. Leave-one-out 1-NN two-sample test,
-    Lopez-Paz and Oquab, "Revisiting Classifier Two-Sample Tests", ICLR 2017.
-    """
-    both = np.concatenate([a, b])
-    both = np.clip((both - both.mean(axis=0)) / (both.std(axis=0) + 1e-9), -5, 5)
-    squares = (both**2).sum(axis=1)
-    distance = squares[:, None] + squares - 2 * both @ both.T
-    np.fill_diagonal(distance, np.inf)
-    is_a = np.arange(len(both)) < len(a)
-    return float((is_a[distance.argmin(axis=1)] == is_a).mean())
-
-
-def _told_apart(
-    clouds: Sequence[Sequence[np.ndarray]],
-    labels: Sequence[np.ndarray],
-    values: Sequence[pd.DataFrame],
-    classes: int,
-) -> dict[str, Any]:
-    """`own_neighbours` of equally many clouds of each class from both sides."""
-    shapes, density = [], []
-    for side in (0, 1):
-        rows: list[int] = []
-        for k in range(classes):
-            equal = min(int((of == k).sum()) for of in labels)
-            rows += np.flatnonzero(labels[side] == k)[:equal].tolist()
-        few = min(len(clouds[side][i]) for i in rows)
-        shapes.append(np.stack([slices(unit_ball(clouds[side][i][:few])) for i in rows]))
-        density.append(values[side].loc[rows, list(_DENSITY)].to_numpy())
-    every = [np.concatenate(one, axis=1) for one in zip(shapes, density, strict=True)]
-    return {
-        "clouds": len(every[0]),
-        "all": own_neighbours(*every),
-        "shape": own_neighbours(*shapes),
-        "density": own_neighbours(*density),
-    }
+    if opened.variant == "points_clean" or "points_clean" not in opened.data.meta["sha256"]:
+        return {}
+    twin = open_pointset(opened.folder, "points_clean", verify=False)
+    off, seen = [], []
+    for i in positions:
+        cloud = np.asarray(opened.data.points[i], dtype=np.float64)
+        truth = np.asarray(twin.points[i], dtype=np.float64)
+        radius = float(np.linalg.norm(truth - truth.mean(axis=0), axis=1).max()) or 1.0
+        off.append(cKDTree(truth).query(cloud)[0] / radius)
+        seen.append((cKDTree(cloud).query(truth)[0] < WITHIN * radius).mean())
+    median, p95 = np.percentile(np.concatenate(off), [50, 95])
+    return {"off": float(median), "off_95": float(p95), "measured": float(np.mean(seen))}
 
 
 def _sampled(cloud: np.ndarray, count: int) -> Float[np.ndarray, "m 3"]:
@@ -369,29 +247,26 @@ def _sampled(cloud: np.ndarray, count: int) -> Float[np.ndarray, "m 3"]:
     return cloud[farthest_point_sampling_np(cloud, count)] if len(cloud) > count else cloud
 
 
-def _of_each(opened: Opened, classes: Sequence[str], limit: int, seed: int) -> list[np.ndarray]:
-    """For each class up to `limit` rows, the same ones for every limit's beginning."""
-    found = []
+def _of_each(opened: Opened, classes: Sequence[str], seed: int) -> list[int]:
+    """Up to 60 clouds of each class, at random."""
+    found: list[int] = []
     for cls in classes:
         rng = np.random.default_rng([seed, 2, opened.data.classes.index(cls)])
-        found.append(rng.permutation(opened.data.members(cls))[:limit])
+        found += rng.permutation(opened.data.members(cls))[:_COMPARED].tolist()
     return found
 
 
-_GLANCE = (
-    ("cloud", "nearest-neighbour spacing", "nn_median", "{:.4f}"),
-    ("cloud", "its coefficient of variation", "nn_variation", "{:.2f}"),
-    ("cloud", "variation of points a voxel (1/8)", "voxel_variation", "{:.2f}"),
-    ("cloud", "directions seen", "directions", "{:.0%}"),
-    ("cloud", "of the lowest third", "below", "{:.0%}"),
-    ("cloud", "repeated points", "copies", "{:.2%}"),
-    ("cloud", "lonely points", "lonely", "{:.2%}"),
-    ("surface", "off the true surface, median", "median_ball", "{:.4f}"),
-    ("surface", "off the true surface, 95 %", "p95_ball", "{:.4f}"),
-    ("surface", "off the true surface, median, as stored", "median", "{:.4f}"),
-    ("surface", "off the true surface, 95 %, as stored", "p95", "{:.4f}"),
-    ("surface", "true surface measured", "measured", "{:.0%}"),
-)
+_GLANCE = {
+    "nn_median": ("nearest-neighbour spacing", "{:.4f}"),
+    "nn_variation": ("its coefficient of variation", "{:.2f}"),
+    "directions": ("directions seen", "{:.0%}"),
+    "below": ("of the lowest third", "{:.0%}"),
+    "copies": ("repeated points", "{:.2%}"),
+    "lonely": ("lonely points", "{:.2%}"),
+    "off": ("off the clean twin, median", "{:.4f}"),
+    "off_95": ("off the clean twin, 95 %", "{:.4f}"),
+    "measured": ("clean twin measured", "{:.0%}"),
+}
 
 
 def pair_text(facts: Mapping[str, Any]) -> str:
@@ -399,11 +274,11 @@ def pair_text(facts: Mapping[str, Any]) -> str:
     prior = pd.DataFrame.from_dict(facts["prior"], orient="index")
     shown = prior.map("{:.1%}".format)
     shown["B - A"] = (100 * (prior["B"] - prior["A"])).map("{:+.1f}".format)
-    rows = {}
-    for of, words, key, form in _GLANCE:
-        values = [side.get(key) for side in facts[of]]
-        if any(value is not None for value in values):
-            rows[words] = ["-" if v is None else form.format(v) for v in values]
+    rows = {
+        words: [form.format(side[key]) if key in side else "-" for side in facts["cloud"]]
+        for key, (words, form) in _GLANCE.items()
+        if any(key in side for side in facts["cloud"])
+    }
     glance = pd.DataFrame.from_dict(rows, orient="index", columns=["A", "B"])
     return render(
         "comparison.md",
@@ -412,3 +287,87 @@ def pair_text(facts: Mapping[str, Any]) -> str:
         total_variation=(prior["A"] - prior["B"]).abs().sum() / 2,
         glance=glance.to_string(),
     )
+
+
+def contact_sheet(
+    clouds: Sequence[np.ndarray | None],
+    titles: Sequence[str],
+    columns: int = _ROW,
+    **words: Any,
+) -> Figure:
+    """A sheet of clouds [P, 3], z up; `words` as of `qs3.utils.pictures.sheet`.
+
+    What lies beside the origin is seen from there, a little from the side: that is where a single
+    view has its camera.
+    """
+    images: list[Image | None] = []
+    for cloud in clouds:
+        if cloud is not None:
+            cloud = np.asarray(cloud, dtype=np.float64)
+            some = cloud[:: max(1, len(cloud) // _POINTS)]
+            images.append(cloud_image(some, _SIDE_PX, AZIMUTH_DEG + turn_deg(cloud)))
+        else:
+            images.append(None)
+    return sheet(images, titles, columns=columns, **words)
+
+
+def class_sheet(data: PointSet, split: str, heading: str = "") -> Figure:
+    """A sheet of up to 60 of a split's clouds, a class a row, drawn at random."""
+    part, columns = data.split(split), _ROW
+    rows: tuple[str, ...] = ()
+    shown: list[int | None] = []
+    if data.labelled:
+        columns = max(2, min(columns, _SHEET // len(part.classes)))
+        rows = tuple(cls for cls in part.classes if len(part.members(cls)))
+        for cls in rows:
+            some = drawn(part.members(cls), columns)
+            shown += [*some, *[None] * (columns - len(some))]
+    else:
+        shown += drawn(np.arange(len(part)), _SHEET)
+    return contact_sheet(
+        [None if i is None else part.points[i] for i in shown],
+        ["" if i is None else _short(part.ids[i]) for i in shown],
+        columns,
+        heading=heading,
+        rows=rows,
+    )
+
+
+def scan_picture(domains: Mapping[str, PointSet], split: str = "train") -> Figure:
+    """One object of each class as each domain has it, two classes a row.
+
+    Where domains share ids (a cloud and its clean twin, surface samples of the same mesh) the
+    object is the same; else it is the domain's first of that class.
+
+    Args:
+        domains: by column title, such as "S: SpeckleNet10".
+        split: which split the objects come from.
+    """
+    sets = [data.split(split) for data in domains.values()]
+    classes = sets[0].classes
+    half = -(-len(classes) // 2)
+    order = [cls for i in range(half) for cls in classes[i::half]]
+    clouds, titles = [], []
+    for cls in order:
+        for cloud in _same_object(sets, cls):
+            clouds.append(cloud)
+            titles.append(cls if cloud is not None else f"no {cls}")
+    return contact_sheet(clouds, titles, 2 * len(sets), heads=[*domains] * 2)
+
+
+def _same_object(sets: Sequence[PointSet], cls: str) -> list[np.ndarray | None]:
+    """A cloud of the class from each set, of the object that most sets have; None if none."""
+    ids = [[data.ids[i] for i in data.members(cls)] for data in sets]
+    everywhere = {name: sum(name in own for own in ids) for own in ids for name in own}
+    best = max(everywhere, key=lambda name: everywhere[name], default=None)
+    found: list[np.ndarray | None] = []
+    for data, own in zip(sets, ids, strict=True):
+        name = best if best in own else next(iter(own), None)
+        found.append(None if name is None else np.asarray(data.points[data.ids.index(name)]))
+    return found
+
+
+def _short(id_: str) -> str:
+    """The end of an id, as a panel has room for."""
+    name = id_.rsplit("/", 1)[-1]
+    return name if len(name) <= 22 else f"…{name[-21:]}"

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import glob
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from qs3.classes import known_as
 from qs3.datasets.object_archive import JUDGE, TIERS, read_archive
@@ -33,19 +33,22 @@ BLOCK = 30
 
 @dataclass(frozen=True)
 class Family:
-    """Runs of one config that saw the same data, one a seed.
+    """Runs of one config that saw the same data.
 
     Attributes:
         name: experiment and hash; or of a classifier that comes with qs3; or the run's path.
-        runs: their result files.
-        seeds: theirs; empty where not known.
         data: what both domains are made of; "" where not known.
+        runs: result files by seed; -1 where that is not known.
     """
 
     name: str
-    runs: tuple[Path, ...]
-    seeds: tuple[int, ...] = ()
     data: str = ""
+    runs: dict[int, Path] = field(default_factory=dict)
+
+    @property
+    def seeds(self) -> list[int]:
+        """In the order of `runs`, where they are known."""
+        return [seed for seed in self.runs if seed >= 0]
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ def judge(
     part = part or (JUDGE if JUDGE in archive.parts else "")
     chosen = archive.of_part(part) if part else list(range(len(archive)))
     families = _families(find_runs(runs))
-    nets = {file: _load(file, floor, device) for family in families for file in family.runs}
+    nets = {file: _load(file, floor, device) for one in families for file in one.runs.values()}
     first = next(iter(nets.values())).classes
     common = tuple(name for name in first if all(name in net.classes for net in nets.values()))
     names = [known_as(str(name), common) for name in archive.cls]
@@ -115,16 +118,16 @@ def judge(
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
     subsets = {"all": np.ones(len(kept), dtype=bool)}
     subsets |= {tier: tiers == tier for tier in TIERS if (tiers == tier).any()}
+    right = [np.stack([called[f] == truth for f in one.runs.values()]) for one in families]
     rows = []
-    guesses = [np.stack([called[file] for file in f.runs]) for f in families]
-    for family, guess in zip(families, guesses, strict=True):
-        a, b = _paired(family, guess == truth, families[0], guesses[0] == truth)
+    for family, mine in zip(families, right, strict=True):
+        more = _less(family, mine, families[0], right[0])
         for tier, of in subsets.items():
             seeds = " ".join(map(str, family.seeds))
             row: dict[str, Any] = {"run": family.name, "seeds": seeds, "tier": tier}
-            row |= _figures(guess[:, of], truth[of], blocks[of], common)
+            row |= _figures(mine[:, of], truth[of], blocks[of], common)
             if family is not families[0]:
-                some = ((a - b)[:, of], truth[of], blocks[of])
+                some = (more[:, of], truth[of], blocks[of])
                 row |= _ends("accuracy_more", difference(*some))
                 row |= _ends("balanced_more", difference(*some, balanced=True))
             rows.append({**row, "data": family.data})
@@ -165,48 +168,35 @@ def find_runs(runs: Sequence[str]) -> list[Path]:
 
 def _families(files: Sequence[Path]) -> list[Family]:
     """The runs of each config that saw the same data."""
-    members: dict[tuple[str, ...], dict[int, Any]] = {}
+    found: dict[tuple[str, ...], Family] = {}
     for file in files:
-        metrics = read_metrics(file.parent)
-        key = (str(file),) if metrics is None else (
-            metrics.experiment, metrics.hash, *metrics.seen.values()
-        )  # fmt: skip
-        of = members.setdefault(key, {})
-        seed = -1 if metrics is None else metrics.seed
-        if seed in of:
-            raise ConfigError(f"{file.parent} and {of[seed][0].parent} are the same run twice")
-        of[seed] = file, metrics
-    found = []
-    for of in members.values():
-        seeds = tuple(sorted(of))
-        runs, results = zip(*(of[seed] for seed in seeds), strict=True)
-        if (first := results[0]) is None:
-            found.append(Family(pretrained_name(runs[0]) or str(runs[0]), runs))
-            continue
-        found.append(Family(f"{first.experiment} {first.hash}", runs, seeds, first.data_text))
-    return found
+        if m := read_metrics(file.parent):
+            key = (m.experiment, m.hash, *m.seen.values())
+            family, seed = Family(f"{m.experiment} {m.hash}", m.data_text), m.seed
+        else:
+            key, family, seed = (str(file),), Family(pretrained_name(file) or str(file)), -1
+        family = found.setdefault(key, family)
+        if seed in family.runs:
+            raise ConfigError(f"{file} and {family.runs[seed]} are the same run twice")
+        family.runs[seed] = file
+    return [replace(one, runs=dict(sorted(one.runs.items()))) for one in found.values()]
 
 
-def _paired(
-    family: Family, right: np.ndarray, base: Family, base_right: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whether both are right by common seed and object; without common seeds means over seeds."""
+def _less(family: Family, right: np.ndarray, base: Family, of_base: np.ndarray) -> np.ndarray:
+    """[s, n] differences in being right: of common seeds; where there are none, of means."""
     if common := sorted({*family.seeds} & {*base.seeds}):
-        return (
-            right[[family.seeds.index(seed) for seed in common]].astype(float),
-            base_right[[base.seeds.index(seed) for seed in common]].astype(float),
-        )
-    return right.mean(axis=0, keepdims=True), base_right.mean(axis=0, keepdims=True)
+        places = [[one.seeds.index(seed) for seed in common] for one in (family, base)]
+        return right[places[0]].astype(float) - of_base[places[1]]
+    return right.mean(axis=0, keepdims=True) - of_base.mean(axis=0, keepdims=True)
 
 
 def _figures(
-    guesses: Int[np.ndarray, "s n"],
+    right: Bool[np.ndarray, "s n"],
     truth: Int[np.ndarray, " n"],
     blocks: Int[np.ndarray, " n"],
     names: Sequence[str],
 ) -> dict[str, Any]:
     """Columns of `Verdict.figures` for some objects."""
-    right = guesses == truth
     counts = np.bincount(truth, minlength=len(names))
     there = [k for k, count in enumerate(counts) if count]
     return {

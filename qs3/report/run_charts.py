@@ -1,4 +1,4 @@
-"""The charts and tables of one run. A chart is a figure, or the reason why there is none.
+"""The charts of a run's page, and its table of pseudo-labels.
 
 Labels of the target that appear here judge a finished run; nothing is chosen by them.
 """
@@ -12,9 +12,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from qs3.evaluation.metrics import CALIBRATION_BINS, reliability
-from qs3.report.run_files import RunFiles
-from qs3.utils.pictures import BLUE, GREEN, GRID, INK, ORANGE, PALE_BLUE, RED, SOFT, blank
+from qs3.runs.metrics import RoundRecord
+from qs3.utils.pictures import BLUE, GREEN, GRID, INK, ORANGE, RED, SOFT, blank
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,12 +21,14 @@ if TYPE_CHECKING:
 _SMALL: dict[str, Any] = {"fontsize": 8.5, "frameon": False}
 
 
-def curves(run: RunFiles) -> Figure | str:
-    """Loss, held-out accuracy in percent and learning rate over the epochs, phases shaded."""
-    history, metrics = run.history, run.metrics
-    if history is None:
-        return "no epoch is done yet"
-    figure, axes = _figure(8.5, 7.2, f"{run.title}: training", (1.0, 1.0, 0.6))
+def curves(title: str, history: pd.DataFrame, marked: Mapping[str, int]) -> Figure:
+    """Loss, held-out accuracy in percent and learning rate over the epochs, phases shaded.
+
+    Args:
+        history: a row an epoch.
+        marked: epochs (from 0) to draw a line at, by name.
+    """
+    figure, axes = _figure(8.5, 7.2, title, (1.0, 1.0, 0.6))
     epochs = history["epoch"] + 1  # people count from 1
     panels = {
         "training loss": [name for name in history if "loss" in name],
@@ -49,40 +50,12 @@ def curves(run: RunFiles) -> Figure | str:
         axes[0].text(of.mean() + 1, 1.02, "warm-up" if phase == 0 else phase - 1, ha="center",
                      transform=axes[0].get_xaxis_transform(), fontsize=8.5,
                      color=SOFT)  # fmt: skip
-    warmup, student = (metrics.warmup.selected, metrics.student) if metrics else (None, None)
-    for who, one, colour in (("teacher", warmup, RED), ("student", student, GREEN)):
-        if one is not None and one.epoch >= 0:
-            for ax in axes:
-                ax.axvline(one.epoch + 1, color=colour, linestyle="--", linewidth=1.1,
-                           label=f"{who}: epoch {one.epoch + 1}")  # fmt: skip
+    for (name, epoch), colour in zip(marked.items(), (RED, GREEN), strict=False):
+        for ax in axes:
+            ax.axvline(epoch + 1, color=colour, linestyle="--", linewidth=1.1,
+                       label=f"{name}: epoch {epoch + 1}")  # fmt: skip
     for ax in axes[:2]:
         ax.legend(**_SMALL)
-    return figure
-
-
-def calibration(run: RunFiles) -> Figure | str:
-    """Reliability diagram of the result, and how many clouds each bin holds."""
-    p = run.predictions
-    if p is None or not np.isfinite(p.probabilities).all():
-        return "there are no predictions" if p is None else "the net has diverged"
-    found = reliability(p.probabilities, p.labels)
-    if found is None:
-        return "the target has no labels"
-    title = (
-        f"{run.title}: calibration on {run.target}\nexpected calibration error "
-        f"{100 * found.error:.1f}% in {CALIBRATION_BINS} bins\n(with target labels, evaluation "
-        "only)"
-    )
-    figure, (upper, lower) = _figure(5.6, 6.6, title, (3.2, 1.0))
-    centre, wide = (np.arange(CALIBRATION_BINS) + 0.5) / CALIBRATION_BINS, 0.92 / CALIBRATION_BINS
-    upper.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle=":", label="perfectly calibrated")
-    upper.bar(centre, np.nan_to_num(found.accuracy), wide, color=BLUE, label="accuracy")
-    upper.plot(found.confidence, found.accuracy, "o", color=ORANGE, markersize=5,
-               label="at the mean confidence")  # fmt: skip
-    upper.set(ylim=(0, 1.02), ylabel="share that is right")
-    upper.legend(**_SMALL, loc="upper left")
-    lower.bar(centre, found.count, wide, color=PALE_BLUE)
-    lower.set(ylabel="clouds", xlabel="confidence: the largest class probability", xlim=(0, 1))
     return figure
 
 
@@ -132,16 +105,16 @@ def pca(features: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 2"]:
     return centred @ (directions * np.where(largest < 0, -1.0, 1.0)).T
 
 
-def pseudo_labels(run: RunFiles) -> pd.DataFrame:
+def pseudo_labels(rounds: Sequence[RoundRecord], classes: Sequence[str]) -> pd.DataFrame:
     """Of each round (column): by class selected/confident and mu or the threshold; theta.
 
     And what they are worth: precision and recall know the target's labels, which judge alone.
     """
     columns = {}
-    for one in run.metrics.rounds if run.metrics else ():
+    for one in rounds:
         kept, by_class = ("thresholds", one.thresholds) if one.mu is None else ("mu", one.mu)
         column: dict[str, Any] = {}
-        for name in run.classes:
+        for name in classes:
             share = f", {kept} {by_class[name]:.2f}" if by_class and name in by_class else ""
             column[name] = f"{one.selected.get(name, 0)}/{one.confident.get(name, 0)}{share}"
         column["theta"] = one.theta

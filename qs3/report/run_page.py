@@ -1,12 +1,14 @@
-"""A run's charts as files in `<run>/pictures`, and a page with them and its clouds.
+"""A run's page: its results, charts as files in `<run>/pictures`, and clouds with predictions.
 
-A picture that has nothing to show is left out, and the page gives the reason.
+What an unfinished run does not have is None. A chart that has nothing to show is left out, and the
+page gives the reason.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import logging
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,30 +18,145 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from qs3.config.hydra import in_multirun
-from qs3.errors import MissingDataError, Qs3Error
+from qs3.datasets.domain import Domain
+from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.evaluation.expected import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.report import run_charts
 from qs3.report.datasets import opened_domain, part_of
-from qs3.report.run_files import RunFiles, domain_of, open_domain, read_run
-from qs3.report.sheets import scan_picture
 from qs3.report.viewer import Part, viewer
-from qs3.runs.metrics import RunMetrics, read_metrics
+from qs3.runs import folder as runs
+from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
+from qs3.runs.predictions import FILE as PREDICTIONS
+from qs3.runs.predictions import Predictions, read_predictions
+from qs3.store.store import PointSet, is_finished
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.page import confusion_rows, render
 from qs3.utils.pictures import save_png
 from qs3.utils.seeding import derive
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
-FOLDER, PAGE = "pictures", "index.html"
-ROLES = ("source", "target")
+FOLDER, PAGE, HISTORY = "pictures", "index.html", "history.csv"
 _CLOUDS, _POINTS = 30, 1024  # on the page: a quarter of a megabyte a run
 _FEATURES = 600  # clouds of each domain in the picture of features
 _WARMUP = "warmup_selected.pt"  # of qs3.selftraining.callback, which imports Lightning
+_DOMAIN = tuple(field.name for field in dataclasses.fields(Domain))
+
+
+@dataclass(frozen=True, eq=False)
+class RunFiles:
+    """A run, read.
+
+    Attributes:
+        folder: of the run.
+        metrics: contents of metrics.json; None if the run is not finished.
+        history: history.csv, one row an epoch; None if no epoch is done.
+        predictions: None if there are none yet.
+        classes: names in label order.
+        config: as composed, not resolved; None if Hydra did not write it.
+        command: that started the run.
+    """
+
+    folder: Path
+    metrics: RunMetrics | None
+    history: pd.DataFrame | None
+    predictions: Predictions | None
+    classes: tuple[str, ...]
+    config: Mapping[str, Any] | None
+    command: str
+
+    @property
+    def title(self) -> str:
+        """Such as "qs3_s2d, seed 0"."""
+        if self.metrics is None:
+            return f"{self.folder.parent.name}/{self.folder.name} (not finished)"
+        return f"{self.metrics.experiment}, seed {self.metrics.seed}"
+
+    @property
+    def target(self) -> str:
+        """The target's name, with "(simulated)" where that is so."""
+        return "the target" if self.metrics is None else self.metrics.target_text
+
+
+def is_run(folder: Path) -> bool:
+    """Whether it is the folder of a run, finished or not."""
+    return any((folder / name).exists() for name in (METRICS, runs.STARTED, HISTORY))
+
+
+def read_run(folder: str | Path) -> RunFiles:
+    """Read a run's folder.
+
+    Raises:
+        MissingDataError: it is not a run's folder.
+        DataError: one of its files is damaged.
+    """
+    import pandas as pd
+    import yaml
+    from omegaconf import OmegaConf
+
+    folder = Path(folder).expanduser()
+    if not is_run(folder):
+        raise MissingDataError(f"{folder} is not the folder of a run")
+    metrics, predictions, history = read_metrics(folder), None, None
+    if (folder / PREDICTIONS).is_file():
+        predictions = read_predictions(folder / PREDICTIONS)
+    classes = tuple(metrics.final.predicted) if metrics else ()
+    hydra: dict[str, Any] = {"config": None, "overrides": ()}
+    try:
+        if (folder / HISTORY).is_file():
+            history = pd.read_csv(folder / HISTORY)
+            history = history if len(history) else None
+        for name in hydra:
+            if (path := folder / ".hydra" / f"{name}.yaml").is_file():
+                hydra[name] = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
+        raise DataError(f"{folder}: {HISTORY} or .hydra is damaged ({error})") from error
+    command = shlex.join(["python", "train.py", *map(str, hydra["overrides"])])
+    return RunFiles(folder, metrics, history, predictions, classes, hydra["config"], command)
+
+
+def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> Domain:
+    """A domain ("source" or "target") as the run's config describes it.
+
+    Raises:
+        MissingDataError: there is no config.
+    """
+    from omegaconf import OmegaConf
+
+    import qs3.config.hydra  # noqa: F401 (registers the resolvers of a config)
+
+    if run.config is None:
+        raise MissingDataError(f"{run.folder} has no .hydra/config.yaml that names its data")
+    cfg = OmegaConf.create(dict(run.config))
+    if data_dir is not None:
+        cfg.paths.data_dir = str(Path(data_dir).absolute())
+    found: Any = OmegaConf.to_container(cfg.data[role], resolve=True)
+    # Not instantiated: the folder may be somebody else's, and a config can name any code.
+    about = {key: found[key] for key in _DOMAIN if key in found}
+    return Domain(**{**about, "published": None, "synthesis": None})
+
+
+def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) -> PointSet:
+    """A domain's dataset, if it is the one that the run used. Nothing is imported or made.
+
+    Raises:
+        MissingDataError: the run is not finished; the dataset is not there, or is another.
+        DataError: it is damaged.
+    """
+    domain = domain_of(run, role, data_dir)
+    if run.metrics is None or not is_finished(domain.folder):
+        raise MissingDataError(f"the run's {role}, {domain.name}, is not at {domain.folder}")
+    data = domain.open(verify=False)
+    if data.sha256 != getattr(run.metrics.data, role):
+        raise MissingDataError(
+            f"{domain.folder} holds another version of {domain.name} than the run used"
+        )
+    return data
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +196,11 @@ def draw(
     if config is not None:
         run = dataclasses.replace(run, config=config)
     out = make_folder(run.folder / FOLDER if out is None else Path(out))
-    charts: dict[str, Callable[[], Figure | str]] = {
-        "curves": lambda: run_charts.curves(run),
-        "calibration": lambda: run_charts.calibration(run),
-        **({"embedding": lambda: _embedding(run, data_dir, packages)} if embed else {}),
-        "domains": lambda: _domains(run, data_dir),
-    }
+    charts: dict[str, Callable[[], Figure | str]] = {"curves": lambda: _curves(run)}
+    if embed:
+        charts["embedding"] = lambda: _embedding(run, data_dir, packages)
     pictures: dict[str, Path] = {}
     skipped: dict[str, str] = {}
-    clouds: dict[str, Any] = {"about": (), "notes": (), "data": None}
     for name, make in charts.items():
         path = out / f"{name}.png"
         path.unlink(missing_ok=True)
@@ -98,11 +211,11 @@ def draw(
         if isinstance(figure, str):
             skipped[name] = figure
         else:
-            save_png(figure, path, colours=256 if name == "domains" else 0)
+            save_png(figure, path)
             pictures[name] = path
+    clouds: dict[str, Any] = {"about": (), "notes": (), "data": None}
     try:
-        part = worst_clouds(run, _CLOUDS, data_dir=data_dir, residuals=False)
-        clouds = viewer([part], points=_POINTS)
+        clouds = viewer([worst_clouds(run, _CLOUDS, data_dir=data_dir)], points=_POINTS)
     except Qs3Error as error:
         skipped["clouds"] = str(error)
     m = run.metrics
@@ -112,13 +225,13 @@ def draw(
         m=m,
         teacher=m and chosen_in_words(m.selection.teacher),
         student=m and m.rounds and chosen_in_words(m.selection.student),
-        quality=m and _quality(m),
+        expected=m and in_words(m.quality.expected),
         confusion=m
         and m.final.confusion
         and confusion_rows(np.array(m.final.confusion), run.classes),
         rounds=m
         and m.rounds
-        and run_charts.pseudo_labels(run).to_html(
+        and run_charts.pseudo_labels(m.rounds, run.classes).to_html(
             border=0, float_format="{:.2f}".format, na_rep=""
         ),
         command=run.command,
@@ -131,26 +244,16 @@ def draw(
     return Drawn(pictures, skipped, out / PAGE)
 
 
-def _quality(metrics: RunMetrics) -> list[tuple[str, str]]:
-    """What can be said of the reported net without labels of the target."""
-    found = metrics.quality
-    return [
-        ("accuracy", in_words(found.expected) or "not known"),
-        ("accuracy on held-out labelled clouds", f"{found.validation_accuracy:.1%}"),
-        ("clouds unlike the labelled ones", f"{found.unlike_source:.1%}"),
-        ("classes never predicted", ", ".join(found.never_predicted) or "none"),
-    ]
-
-
-def _domains(run: RunFiles, data_dir: str | Path | None) -> Figure | str:
-    """One object of each class in both domains."""
-    sets = {role: open_domain(run, role, data_dir) for role in ROLES}
-    if not all(data.labelled for data in sets.values()):
-        return "a domain has no labels to choose objects by"
-    if sets["source"].classes != sets["target"].classes:
-        return "the two domains do not have the same classes"
-    titles = (f"{role}: {domain_of(run, role, data_dir).label}" for role in ROLES)
-    return scan_picture(dict(zip(titles, sets.values(), strict=True)))
+def _curves(run: RunFiles) -> Figure | str:
+    """Training, or why there is nothing to draw."""
+    if run.history is None:
+        return "no epoch is done yet"
+    marked = {}
+    if m := run.metrics:
+        marked = {"teacher": m.warmup.selected.epoch}
+        marked |= {"student": m.student.epoch} if m.student else {}
+    marked = {who: epoch for who, epoch in marked.items() if epoch >= 0}
+    return run_charts.curves(f"{run.title}: training", run.history, marked)
 
 
 def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[str]) -> Figure | str:
@@ -164,7 +267,7 @@ def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[st
     from qs3.inference.model_file import PACKAGES, build_net, read_result
     from qs3.runs.checkpoints import load
 
-    sets = {role: open_domain(run, role, data_dir) for role in ROLES}
+    sets = {role: open_domain(run, role, data_dir) for role in ("source", "target")}
     assert run.metrics is not None
     result, packages = read_result(run.folder), (*PACKAGES, *packages)
     nets = {"result": build_net(result, packages)}
@@ -202,7 +305,6 @@ def worst_clouds(
     most: int,
     match: str = "",
     data_dir: str | Path | None = None,
-    residuals: bool = True,
 ) -> Part:
     """Clouds of the run's target with its predictions, for the viewer.
 
@@ -214,7 +316,6 @@ def worst_clouds(
         most: clouds.
         match: a part of their ids.
         data_dir: where the datasets lie; None: where the run's config says.
-        residuals: as `part_of`.
 
     Raises:
         MissingDataError: the run's target is not there, or there are no predictions.
@@ -230,7 +331,7 @@ def worst_clouds(
     data = open_domain(run, "target", data_dir)
     place = {id_: i for i, id_ in enumerate(data.ids)}
     opened = opened_domain(domain_of(run, "target", data_dir), data)
-    part = part_of(opened, [place[p.ids[i]] for i in chosen], residuals)
+    part = part_of(opened, [place[p.ids[i]] for i in chosen])
     shown = [
         dataclasses.replace(
             one,

@@ -16,10 +16,8 @@ from qs3.errors import DataError, MissingDataError
 from qs3.inference.inputs import clouds_of, find_files
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.datasets import chosen, open_named, part_of
-from qs3.report.run_files import is_run, read_run
-from qs3.report.run_page import worst_clouds
-from qs3.report.sheets import drawn
-from qs3.report.viewer import Part, Shown, page, points_each
+from qs3.report.run_page import is_run, read_run, worst_clouds
+from qs3.report.viewer import Part, Shown, drawn, page, points_each
 from qs3.store.meta import is_finished
 from qs3.utils.progress import progress_bar
 

@@ -51,7 +51,7 @@ class OverLauncher(BasicSweeper):
 
 
 class ListedJobs(OverLauncher):
-    """Runs the jobs in a JSON file: a list of lists of overrides. See `qs3.report.tables`.
+    """Runs the jobs in a JSON file: a list of lists of overrides. See `qs3.report.running`.
 
     Args:
         file: of the jobs.

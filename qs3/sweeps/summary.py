@@ -108,7 +108,7 @@ class SummaryOfSeeds(Callback):
         if self.table and self.objective is not None and jobs:
             sys.stdout.write(objectives(jobs, self.objective) + "\n")
         elif self.table and any((folder / METRICS).is_file() for folder in folders):
-            from qs3.report.tables.results import summarise
+            from qs3.report.results import summarise
 
             sys.stdout.write(summarise(folders, differences(jobs)) + "\n")
         sys.stdout.write(failures(jobs))

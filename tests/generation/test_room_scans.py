@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 from trimesh.proximity import closest_point_naive
 
@@ -22,9 +21,7 @@ from qs3.generation.scenes import Room, Support
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import OnFurniture
-from qs3.report.datasets import surfaces_of
 from qs3.sensors.renderers.base import Scene
-from qs3.store.meta import ManifestRow
 from qs3.utils.seeding import object_rng
 from tests.generation.generating import composed
 
@@ -208,14 +205,6 @@ def test_a_scan_of_a_raised_object_is_of_it_alone(cfg, made, lamp):
     twin = cloud.arrays["points_clean"]
     solid = trimesh.Trimesh(lamp.placed.vertices, lamp.placed.faces, process=False)
     assert closest_point_naive(solid, twin[::32].astype(float))[1].max() < 1e-3
-    # The placed mesh is found again for `qs3 compare`.
-    settings = OmegaConf.to_container(cfg.recipe, resolve=True)
-    catalogue = {"_target_": "qs3.catalogue.Catalogue", "seed": 1, "train": 20, "test": 0}
-    meta = {"settings": {"recipe": settings, "meshes": catalogue, "seed": lamp.seed}}
-    found = surfaces_of(meta).mesh(
-        ManifestRow(id=lamp.id, cls="lamp", split="train", mesh_sha256=lamp.mesh.sha256)
-    )
-    np.testing.assert_array_equal(found.vertices, lamp.placed.vertices)
 
 
 def test_a_piece_is_drawn_among_those_that_are_large_enough():

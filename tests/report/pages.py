@@ -21,8 +21,3 @@ def places(cloud):
     """[n, 3] above the corner of its box."""
     raw = np.frombuffer(base64.b64decode(cloud["xyz"]), "<u2")
     return raw.reshape(-1, 3) * cloud["step"]
-
-
-def levels(cloud, key):
-    """[n] of "view" or "residual"."""
-    return np.frombuffer(base64.b64decode(cloud[key]), np.uint8)

@@ -6,19 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
-from trimesh.triangles import closest_point
 
-from qs3.catalogue import Catalogue
 from qs3.errors import ConfigError
-from qs3.generation.kept import NO_RESIDUAL_M, PROVENANCE
-from qs3.meshes.mesh import Mesh
-from qs3.meshes.placement import UnitCube
 from qs3.report import inspection
-from qs3.report.datasets import chosen, distance_to_mesh, open_named, part_of, surfaces_of
+from qs3.report.datasets import chosen, open_named
+from qs3.report.viewer import drawn
 from qs3.store.meta import ManifestRow
 from qs3.store.store import write_pointset
-from qs3.utils.seeding import object_rng
+from qs3.utils.pictures import save_png
 from tests.fixtures import published as fixtures
 from tests.report.made_runs import not_blank
 from tests.running import main
@@ -35,9 +30,7 @@ def test_an_even_grid_has_one_spacing():
     radius = np.hypot(3.5, 3.5)
     assert (of["x"], of["y"], of["z"], of["largest"], of["floor"]) == (7, 7, 0, 7, 0)
     assert of["nn_median"] == pytest.approx(1 / radius)
-    assert of["nn_low"] == pytest.approx(of["nn_high"])
     assert of["nn_variation"] == pytest.approx(0, abs=1e-5)
-    assert of["nn_stored"] == pytest.approx(1)
     assert of["copies"] == of["lonely"] == 0
     assert of["radius"] == of["off_centre"] == pytest.approx(radius)
 
@@ -54,19 +47,6 @@ def test_directions_of_a_sphere_and_of_its_upper_half():
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     assert inspection.coverage(x) == (1, 1)
     assert inspection.coverage(x[x[:, 2] > 0]) == (0.5, 0)
-
-
-def test_slices_do_not_know_how_a_cloud_is_turned_about_z():
-    rng = np.random.default_rng(0)
-    cloud = rng.normal(size=(400, 3)) * [1, 0.3, 2]
-    turn = np.linalg.qr(rng.normal(size=(2, 2)))[0]
-    turned = np.column_stack([cloud[:, :2] @ turn, cloud[:, 2]])
-    assert inspection.slices(cloud).shape == (53,)
-    axis = np.column_stack([cloud[:, :2] @ [[0, 1], [-1, 0]], cloud[:, 2]])
-    np.testing.assert_allclose(inspection.slices(axis), inspection.slices(cloud), atol=1e-9)
-    shares = inspection.slices(turned)[:10] ** 2
-    np.testing.assert_allclose(shares, inspection.slices(cloud)[:10] ** 2, atol=1e-9)
-    assert shares.sum() == pytest.approx(1)
 
 
 def store(folder, clouds, ids, splits, classes=("a", "b"), meta=None, **more):
@@ -120,97 +100,6 @@ def test_a_sample_is_drawn_and_always_the_same(tmp_path):
     assert some.equals(inspection.measured(opened, 4))
 
 
-def distances(points, mesh):
-    """[n] distance of each point from a mesh, by that from every triangle."""
-    corners = mesh.vertices[mesh.faces]  # [f, 3, 3]
-    every = (closest_point(corners, np.tile(p, (len(corners), 1))) - p for p in points)
-    return np.array([np.linalg.norm(to, axis=1).min() for to in every])
-
-
-def test_distance_to_a_mesh_is_that_of_brute_force():
-    mesh = Catalogue(train=1, test=0, classes=("chair",)).items()[0].load()
-    rng = np.random.default_rng(0)
-    points = rng.uniform(mesh.bounds[0] - 0.2, mesh.bounds[1] + 0.2, (60, 3))
-    found = distance_to_mesh(points, mesh)
-    np.testing.assert_allclose(found, distances(points, mesh), atol=1e-9)
-    one = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
-    points = np.array([[0.2, 0.2, 0.5], [2, 0, 0], [-3, -4, 0], [1, 1, 0]])
-    assert distance_to_mesh(points, one) == pytest.approx([0.5, 1, 5, np.sqrt(0.5)])
-
-
-SOURCE = {"_target_": "qs3.catalogue.Catalogue", "seed": 3, "train": 2, "test": 0,
-          "classes": ["chair"]}  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def generated(tmp_path_factory):
-    """Random points about two chairs of the catalogue; the second is another mesh by its hash."""
-    folder = tmp_path_factory.mktemp("generated")
-    items = Catalogue(seed=3, train=2, test=0, classes=("chair",)).items()
-    placed = [UnitCube().place(i.load(), object_rng(5, i.id, 0), i.id) for i in items]
-    rng = np.random.default_rng(0)
-    hashes = (items[0].load().sha256, "0" * 64)
-    write_pointset(
-        folder, name="s", classes=("chair",),
-        arrays={"points": [rng.uniform(*mesh.bounds, (20, 3)) for mesh in placed]},
-        rows=[ManifestRow(item.id, "chair", "train", mesh_sha256=sha)
-              for item, sha in zip(items, hashes, strict=True)],
-        meta={"settings": {"seed": 5, "recipe": {}, "meshes": SOURCE}},
-    )  # fmt: skip
-    return open_named(str(folder), {}), placed
-
-
-def test_the_mesh_is_the_truth_where_it_can_be_made_again(generated):
-    opened, placed = generated
-    part = part_of(opened, [0, 1])
-    assert part.residual_of == "distance to the mesh"
-    known, other = part.shown
-    np.testing.assert_allclose(known.residual, distances(known.points, placed[0]), atol=1e-6)
-    assert other.residual is None
-    found = inspection.surface(opened, ["chair"])
-    assert found["truth"] == "mesh"
-    assert found["median"] == pytest.approx(np.median(known.residual), rel=1e-5)
-    evil = {"seed": 0, "recipe": {"placing": {"_target_": "os.system", "command": "false"}}}
-    assert surfaces_of({"settings": {**evil, "meshes": SOURCE}}) is None
-    assert surfaces_of({}) is None
-
-
-def test_without_meshes_the_clean_twin_is_the_truth(tmp_path):
-    clouds, clean = np.random.default_rng(0).normal(size=(2, 3, 6, 3))
-    ids = ["a/0", "b/1", "a/2"]
-    store(tmp_path / "s", clouds, ids, ["train"] * 3, points_clean=clean)
-    opened = open_named(str(tmp_path / "s"), {})
-    part = part_of(opened, [0, 1, 2])
-    assert "clean twin" in part.residual_of
-    for one, twin in zip(part.shown, opened.twin.points, strict=True):
-        every = np.linalg.norm(one.points[:, None] - twin[None].astype(float), axis=2)
-        np.testing.assert_allclose(one.residual, every.min(axis=1))
-    assert part_of(opened, [0], residuals=False).shown[0].residual is None
-    found = inspection.surface(opened, ["a"])
-    off = [cKDTree(clean[i].astype("f4")).query(clouds[i].astype("f4"))[0] for i in (0, 2)]
-    assert (found["truth"], found["median"]) == ("clean twin", pytest.approx(np.median(off)))
-
-
-def test_provenance_gives_views_and_errors_of_the_measured_points_alone(tmp_path):
-    table = np.zeros((2, 6, 5))
-    table[..., 0] = np.arange(6) % 4
-    table[..., 3] = [0.1, -0.2, NO_RESIDUAL_M, 0, 0.3, -0.4]
-    clouds, clean = np.random.default_rng(0).normal(size=(2, 2, 6, 3))
-    write_pointset(
-        tmp_path, name="s", classes=("a",),
-        rows=[ManifestRow(f"a/{i}", "a", "train") for i in "01"],
-        arrays={"points": clouds, "points_clean": clean, "provenance": table}, meta={},
-        tables={"provenance": PROVENANCE},
-    )  # fmt: skip
-    part = part_of(open_named(str(tmp_path), {}), [1, 0], residuals=False)  # these cost nothing
-    assert [one.name for one in part.shown] == ["a/1", "a/0"]
-    for one in part.shown:
-        np.testing.assert_array_equal(one.view, np.arange(6) % 4)
-        np.testing.assert_allclose(one.residual, [0.1, 0.2, np.nan, 0, 0.3, 0.4], rtol=1e-6)
-    clean_part = part_of(open_named(str(tmp_path), {"variant": "points_clean"}), [0])
-    assert clean_part.shown[0].view is clean_part.shown[0].residual is None
-
-
 class Labelled:
     def __init__(self, labels):
         self.labels = np.array(labels)
@@ -227,18 +116,16 @@ def test_as_many_of_each_class_as_there_is_room_for(labels, most):
     assert chosen(Labelled([0, 1, 0, 1, 0]), 9, "0/") == [0, 2, 4]
 
 
-def test_nearest_neighbours_are_those_of_all_distances():
-    rng = np.random.default_rng(3)
-    a, b = rng.normal(size=(30, 4)), rng.normal(0.7, 2, size=(30, 4))
-    x = np.concatenate([a, b])
-    x = np.clip((x - x.mean(axis=0)) / x.std(axis=0), -5, 5)
-    own = 0
-    for i in range(60):
-        others = [j for j in range(60) if j != i]
-        nearest = min(others, key=lambda j: np.linalg.norm(x[i] - x[j]))
-        own += (nearest < 30) == (i < 30)
-    assert inspection.own_neighbours(a, b) == own / 60
-    assert inspection.own_neighbours(a, a + 9) == 1
+def test_the_clean_twin_is_the_truth(tmp_path):
+    clouds, clean = np.random.default_rng(0).normal(size=(2, 3, 6, 3))
+    store(tmp_path, clouds, ["a/0", "b/1", "a/2"], ["train"] * 3, points_clean=clean)
+    found = inspection.surface(open_named(str(tmp_path), {}), [0, 2])
+    off = []
+    for cloud, twin in zip(clouds.astype("f4")[[0, 2]], clean.astype("f4")[[0, 2]], strict=True):
+        every = np.linalg.norm(cloud[:, None].astype(float) - twin[None], axis=2).min(axis=1)
+        off.append(every / np.linalg.norm(twin - twin.mean(axis=0), axis=1).max())
+    assert found["off"] == pytest.approx(np.median(off), rel=1e-5)
+    assert inspection.surface(open_named(str(tmp_path), {"variant": "points_clean"}), [0]) == {}
 
 
 def test_one_dataset_against_itself_has_no_gap_and_others_need_a_common_class(tmp_path):
@@ -249,11 +136,47 @@ def test_one_dataset_against_itself_has_no_gap_and_others_need_a_common_class(tm
     opened, bare = (open_named(str(tmp_path / name), {}) for name in ("s", "bare"))
     facts = inspection.compare(opened, opened)
     assert facts["prior"] == {"a": {"A": 0.5, "B": 0.5}, "b": {"A": 0.5, "B": 0.5}}
-    assert facts["told_apart"]["all"] < 0.5  # the twin in the other set is the nearest
     assert facts["cloud"][0] == facts["cloud"][1]
-    assert facts["surface"][0]["p95"] == pytest.approx(0, abs=1e-6)
+    assert facts["cloud"][0]["off_95"] == pytest.approx(0, abs=1e-6)
     with pytest.raises(ConfigError):
         inspection.compare(opened, bare)
+
+
+def furniture(folder, ids):
+    clouds = [np.random.default_rng(i).normal(size=(20, 3)) for i in range(len(ids))]
+    return store(folder, clouds, ids, ["train"] * len(ids), ("bed", "chair", "sofa"))
+
+
+def words(figure):
+    return [text.get_text() for text in figure.texts]
+
+
+def test_same_object_in_all_domains_where_possible(tmp_path):
+    a = furniture(tmp_path / "a", ["bed/1", "bed/2", "chair/1"])
+    b = furniture(tmp_path / "b", ["bed/2", "bed/3"])
+    c = furniture(tmp_path / "c", ["bed/9", "sofa/1"])
+    beds = inspection._same_object([a, b, c], "bed")
+    for found, (data, index) in zip(beds, [(a, 1), (b, 0), (c, 0)], strict=True):
+        np.testing.assert_array_equal(found, data.points[index])
+    titles = words(inspection.scan_picture({"A": a, "B": b, "C": c}))
+    assert {"A", "B", "C", "bed", "chair", "no chair", "sofa", "no sofa"} <= {*titles}
+
+
+def test_a_class_sheet_has_a_row_a_class(tmp_path):
+    data = furniture(tmp_path / "d", [f"bed/{i}" for i in range(9)] + ["sofa/椅子"])
+    figure = inspection.class_sheet(data, "train", "all of them")
+    assert {"bed", "sofa", "all of them", "椅子"} <= {*words(figure)}
+    assert len([title for title in words(figure) if title.isdigit()]) == 6
+    save_png(figure, tmp_path / "a.png", colours=256)
+    assert not_blank(tmp_path / "a.png")
+
+
+def test_what_is_drawn_is_not_at_even_steps():
+    """Families of a catalogue take turns: at even steps all shown would be of one."""
+    found = drawn(np.arange(100), 10)
+    assert found == sorted({*found})
+    assert len({i % 10 for i in found}) > 4
+    assert drawn(np.array([5, 7]), 2) == [5, 7]
 
 
 def test_commands(tmp_path, capsys):
@@ -270,7 +193,7 @@ def test_commands(tmp_path, capsys):
     words = ["compare", "modelnet10", f"{tmp_path}/kinectsim10", f"out={tmp_path / 'c'}"]
     assert main([*words, f"a.paths.data_dir={tmp_path}", "b.variant=points_clean"]) == 0
     facts = json.loads((tmp_path / "c" / "comparison.json").read_text())
-    assert 0 <= facts["told_apart"]["density"] <= 1
+    assert facts["cloud"][0]["directions"] > 0
     assert (tmp_path / "c" / "comparison.md").read_text().startswith("# A = ModelNet10")
     for wrong in (["nothing10"], ["modelnet10", "variantt=points"], ["/nowhere/at/all"]):
         assert main(["inspect", *wrong]) == 1

@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from qs3.report.tables.comparison import against
-from qs3.report.tables.table import build_table
+from qs3.report.comparison import against
+from qs3.report.table import build_table
 from tests.running import ROOT
 
 RESULTS = ROOT / "docs" / "results"
@@ -24,10 +24,12 @@ def test_means_stand_on_the_page(table, kept, target, page, tmp_path):
     """Every accuracy of several seeds, with its standard error."""
     built = build_table(table, tmp_path, (), target, RESULTS / f"{kept}.csv.gz")
     text = (RESULTS / f"{page}.md").read_text("utf-8")
-    cells = [c for c in built.cells if c.finished and c.column not in ("S → K", "S → C", "R → A0")]
+    cells = [
+        c for c in built.cells if c.runs.seeds and c.column not in ("S → K", "S → C", "R → A0")
+    ]
     assert cells
     for cell in cells:
-        stat = cell.ours("accuracy")
+        stat = cell.runs.stat("accuracy")
         shown = stat.percent() if stat.sem is not None else f"{100 * stat.mean:.1f}"
         assert shown in text, cell.row
 

@@ -17,9 +17,8 @@ from qs3.config import hashing
 from qs3.errors import DataError, MissingDataError
 from qs3.inference.model_file import Result, write_result
 from qs3.models.pointnet import pointnet
-from qs3.report import run_charts
-from qs3.report.run_files import read_run
-from qs3.report.run_page import AfterTraining, draw
+from qs3.report import run_charts, run_page
+from qs3.report.run_page import AfterTraining, draw, read_run
 from qs3.runs.checkpoints import save
 from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
 from qs3.runs.predictions import read_predictions, write_predictions
@@ -30,7 +29,7 @@ from tests.report.pages import data_of
 from tests.running import main
 from tests.training.toy import CLASSES
 
-ALL = ["curves", "calibration", "domains"]
+ALL = ["curves"]
 
 
 def texts(ax):
@@ -78,7 +77,7 @@ def test_curves_are_the_history(run):
     scores = {"7": 0.1, "8": 0.3, "9": 0.2}
     student = StudentChoice(rule="snd", epoch=8, score=0.3, scores=scores, held_out=0, last=last)
     change(run, student=student)
-    rows, axes = table(run / "history.csv"), run_charts.curves(read_run(run)).axes
+    rows, axes = table(run / "history.csv"), run_page._curves(read_run(run)).axes
     loss, accuracy = line(axes[0], "train/loss"), line(axes[1], "source_val/acc")
     from_1 = [int(row["epoch"]) + 1 for row in rows]
     np.testing.assert_allclose(loss, [from_1, [float(row["train/loss"]) for row in rows]])
@@ -104,7 +103,8 @@ def test_confusion_is_that_of_the_predictions(run):
 
 
 def test_pseudo_labels_are_those_of_the_tables(run):
-    shown, records = run_charts.pseudo_labels(read_run(run)), read_metrics(run).rounds
+    records = read_metrics(run).rounds
+    shown = run_charts.pseudo_labels(records, CLASSES)
     for r, record in enumerate(records):
         rows = table(run / f"round_{r:02d}" / "pseudo_labels.csv")
         kept = Counter(row["label"] for row in rows if row["selected"] == "1")
@@ -118,14 +118,13 @@ def test_pseudo_labels_are_those_of_the_tables(run):
             assert column[f"{key} (evaluation only)"] == getattr(judged, key)
 
 
-def test_a_net_that_has_diverged_has_no_calibration_and_a_page_that_browsers_read(run):
+def test_a_net_that_has_diverged_has_a_page_that_browsers_read(run):
     """JSON.parse takes no NaN: the page would stay without its clouds."""
     p = read_predictions(run / "predictions.csv")
     lost = replace(p, probabilities=np.full_like(p.probabilities, np.nan))
     write_predictions(run / "predictions.csv", lost)
-    drawn = draw(run, embed=False)
-    assert "diverged" in drawn.skipped["calibration"]
-    assert {one["sure"] for one in data_of(drawn.page.read_text())["clouds"]} == {None}
+    page = draw(run, embed=False).page.read_text()
+    assert {one["sure"] for one in data_of(page)["clouds"]} == {None}
 
 
 def test_unlabelled_target(run):
@@ -138,9 +137,7 @@ def test_unlabelled_target(run):
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows({**row, "label": ""} for row in rows)
-    drawn = draw(run, embed=False)
-    assert {*drawn.skipped} == {"calibration"}
-    page = drawn.page.read_text()
+    page = draw(run, embed=False).page.read_text()
     assert "in doubt first" in page
     assert "is \\ called" not in page
     assert "recall (evaluation only)" not in page
@@ -150,10 +147,10 @@ def test_unfinished_run_and_stale_pictures(run):
     (run / "metrics.json").unlink()
     (run / "predictions.csv").unlink()
     (run / "pictures").mkdir()
-    (run / "pictures" / "calibration.png").touch()
+    (run / "pictures" / "embedding.png").touch()
     drawn = draw(run)
     assert list(drawn.pictures) == ["curves"]
-    assert not (run / "pictures" / "calibration.png").exists()
+    assert not (run / "pictures" / "embedding.png").exists()
     assert "not finished" in drawn.page.read_text()
     (run / "history.csv").write_text("epoch,phase,lr\n")
     assert "no epoch" in draw(run).skipped["curves"]
@@ -197,7 +194,7 @@ def test_command_with_a_net_of_ones_own(run, toy_data, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]
     assert main([*words, f"packages={__name__}"]) == 0
-    shown = [*(f"{name}.png" for name in (*ALL[:2], "embedding", ALL[2])), "index.html"]
+    shown = [*(f"{name}.png" for name in ("curves", "embedding")), "index.html"]
     assert capsys.readouterr().out.splitlines() == [str(out / name) for name in shown]
     assert not_blank(out / "embedding.png")
 
@@ -208,11 +205,11 @@ def test_missing_or_damaged_data_cost_their_pictures_and_not_the_page(run, toy_d
     shutil.copytree(toy_data, data_dir)
     (data_dir / "kinectsim10" / "points.npy").write_bytes(b"no array")
     drawn = draw(run, data_dir=data_dir)
-    assert {*drawn.skipped} == {"embedding", "domains", "clouds"}
+    assert {*drawn.skipped} == {"embedding", "clouds"}
     assert "<li>embedding: " in drawn.page.read_text()
-    assert "is not at" in draw(run, data_dir=tmp_path).skipped["domains"]
+    assert "is not at" in draw(run, data_dir=tmp_path).skipped["clouds"]
     change(run, data=DataHashes(source="0" * 64, target="0" * 64))
-    assert "another version of specklenet10" in draw(run, embed=False).skipped["domains"]
+    assert "another version of kinectsim10" in draw(run, embed=False).skipped["clouds"]
 
 
 def test_features_of_both_domains_on_the_plane_of_largest_variance():

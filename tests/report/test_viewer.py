@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from qs3.errors import DataError
 from qs3.report.viewer import Part, Shown, page, points_each, thinned
 from qs3.utils.pictures import AZIMUTH_DEG
-from tests.report.pages import data_of, levels, places
+from tests.report.pages import data_of, places
 
 RNG = np.random.default_rng(0)
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
@@ -57,9 +57,9 @@ class Tags(HTMLParser):
 
 def test_names_stay_text():
     shown = [one(name, label=name, called=name, sure=0.5, note=name) for name in HOSTILE]
-    hostile = page(HOSTILE[0], [Part(shown, HOSTILE[0], HOSTILE[5], HOSTILE[1], HOSTILE)])
+    hostile = page(HOSTILE[0], [Part(shown, HOSTILE[0], HOSTILE[5], HOSTILE)])
     harmless = [one(str(i), label="a", called="b", sure=0.5, note="c") for i in range(len(shown))]
-    usual = page("t", [Part(harmless, "about", "m", "x", ["failed"] * len(HOSTILE))])
+    usual = page("t", [Part(harmless, "about", "m", ["failed"] * len(HOSTILE))])
     assert Tags(hostile).seen == Tags(usual).seen
     assert Tags(hostile).attributes == Tags(usual).attributes
     found = data_of(hostile)
@@ -69,30 +69,21 @@ def test_names_stay_text():
 
 
 def test_colours_are_those_that_something_is_known_of():
-    assert data_of(of(one(), colour="view"))["modes"] == ["height"]
-    full = one(view=np.arange(8), residual=np.arange(8.0), label="chair", called="sofa", sure=0.9)
-    found = data_of(of(one("b", label="bed"), full, colour="residual"))
-    assert found["modes"] == ["height", "view", "residual", "class", "confidence"]
-    assert found["colour"] == "residual"
+    assert data_of(of(one(), colour="class"))["modes"] == ["height"]
+    full = one(label="chair", called="sofa", sure=0.9)
+    found = data_of(of(one("b", label="bed"), full, colour="confidence"))
+    assert found["modes"] == ["height", "class", "confidence"]
+    assert found["colour"] == "confidence"
     assert found["classes"] == ["bed", "chair"]
-    assert len(found["view_colours"]) == len(found["views"]) == 8
-
-
-def test_residuals_have_254_steps_and_a_sign_for_not_known():
-    residual = np.array([0.0, 0.01, 0.02, 0.04, 7.0, np.nan, *[0.02] * 6])
-    found = data_of(of(one(count=12, residual=residual)))
-    assert found["residual_most"] == "0.05"  # nine of ten lie below 0.04
-    want = [0, 51, 102, 203, 254, 255, *[102] * 6]
-    assert levels(found["clouds"][0], "residual").tolist() == want
+    assert len(found["class_colours"]) == 2
 
 
 def test_many_points_are_drawn_from_and_the_page_says_so():
     cloud = np.arange(60.0).reshape(20, 3)
-    whole = Shown("a", cloud, view=np.arange(20), residual=np.arange(20.0))
+    whole = Shown("a", cloud)
     few = thinned(whole, 7)
     assert few.of == 20
-    np.testing.assert_array_equal(few.points, cloud[few.view])
-    np.testing.assert_array_equal(few.view, few.residual)
+    assert set(few.points[:, 0]) <= set(cloud[:, 0])
     assert thinned(whole, 20) is whole
     text = of(whole, one("b", 5), points=7)
     assert "at most 7 points of a cloud are shown" in text

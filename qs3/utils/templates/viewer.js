@@ -7,7 +7,7 @@
 (() => {
   const page = JSON.parse(document.getElementById("clouds").textContent);
   const START = { ...page.start, zoom: 1, x: 0, y: 0 };
-  const PAPER = [247, 248, 250], PALE = [237, 240, 245], UNKNOWN = [176, 182, 192], NONE = 255;
+  const PAPER = [247, 248, 250], PALE = [237, 240, 245], UNKNOWN = [176, 182, 192];
   const find = (id) => document.getElementById(id);
   const grid = find("grid"), colour = find("colour"), list = find("list"), words = find("words");
   const together = find("together"), true_size = find("true-size"), size = find("size");
@@ -43,14 +43,6 @@
     height: (cloud, xyz) => {
       const tall = cloud.size[2] / cloud.radius;
       return (i) => ramp(tall ? 0.02 + 0.86 * (xyz[3 * i + 2] / tall + 0.5) : 0.02);
-    },
-    view: (cloud) => {
-      const views = cloud.view && bytes(cloud.view);
-      return (i) => (views ? hue(page.view_colours, views[i]) : UNKNOWN);
-    },
-    residual: (cloud) => {
-      const far = cloud.residual && bytes(cloud.residual);
-      return (i) => (!far || far[i] === NONE ? UNKNOWN : ramp(far[i] / (NONE - 1)));
     },
     class: (cloud) => () => hue(page.class_colours, page.classes.indexOf(kind(cloud))),
     confidence: (cloud) => () => (cloud.sure === null ? UNKNOWN : ramp(cloud.sure)),
@@ -246,12 +238,7 @@
     const shown = {
       height: () => bar("low", "high", 0.02, 0.88),
       confidence: () => bar("0%", "100%"),
-      residual: () => [
-        ...bar("0", `${page.residual_most}${page.unit && ` ${page.unit}`} or more`),
-        entry(UNKNOWN, "not known"), element("span", "soft", page.residual_of),
-      ],
       class: () => page.classes.map((name, k) => entry(hue(page.class_colours, k), name)),
-      view: () => page.views.map((k) => entry(hue(page.view_colours, k), `view ${k}`)),
     };
     box.replaceChildren(...shown[mode]());
   }

@@ -5,10 +5,10 @@ import shlex
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.report.tables.running import Job, launch, missing
-from qs3.report.tables.spec import chosen
-from qs3.report.tables.table import build_table
-from tests.report.tables.filled import run_cell
+from qs3.report.running import Job, launch, missing
+from qs3.report.spec import chosen
+from qs3.report.table import build_table
+from tests.report.filled import run_cell
 from tests.running import main
 from tests.training.toy import overrides, write_toy
 

@@ -10,13 +10,13 @@ import json
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from qs3.config.compose import override
 from qs3.config.location import python_command
-from qs3.report.tables.spec import chosen
-from qs3.report.tables.table import Table
+from qs3.report.spec import chosen
+from qs3.report.table import Table
 
 LAUNCHERS: Mapping[str, str | None] = {
     "basic": None,
@@ -29,14 +29,8 @@ LAUNCHERS: Mapping[str, str | None] = {
 """Hydra's launchers, and the setting of each for how many jobs run at the same time, if any."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """One seed of one cell.
-
-    Attributes:
-        name: row, column and seed, for people.
-        overrides: of train.py.
-    """
+class Job(NamedTuple):
+    """One seed of one cell: row, column and seed, for people, and the overrides of train.py."""
 
     name: str
     overrides: tuple[str, ...]
@@ -52,13 +46,13 @@ def missing(table: Table, seeds: Sequence[int] = (), rows: Sequence[str] = ()) -
         seeds: that each cell should have; none: those that the table wants.
         rows: only those that these words mean (`spec.chosen`); all if empty.
     """
-    meant = chosen(table.rows, rows, "rows: ")
-    cells = [cell for cell in table.cells if cell.runnable and cell.row in meant]
+    meant = chosen(table.rows, rows)
     jobs: dict[tuple[str, ...], Job] = {}
-    for cell in sorted(cells, key=lambda cell: not cell.entry.first):
-        done = set(cell.runs.seeds) if cell.runs else set()
+    for cell in sorted(table.cells, key=lambda cell: not cell.entry.first):
+        if not cell.overrides or cell.row not in meant:
+            continue
         for seed in seeds or cell.seeds:
-            if seed not in done:
+            if seed not in cell.runs.seeds:
                 overrides = (*cell.overrides, f"seed={seed}")
                 where = f"{cell.row}, {cell.column}" if len(table.columns) > 1 else cell.row
                 jobs.setdefault(overrides, Job(f"{where}, seed {seed}", overrides))
@@ -85,16 +79,15 @@ def launch(
     if not jobs:
         return 0
     key = LAUNCHERS[launcher]
-    limit = [f"{key}={at_once}"] if key and at_once else []
     with tempfile.TemporaryDirectory(prefix="qs3-table-") as folder:
         file = Path(folder) / "jobs.json"
-        file.write_text(json.dumps([list(job.overrides) for job in jobs]), encoding="utf-8")
+        file.write_text(json.dumps([job.overrides for job in jobs]), encoding="utf-8")
         words = [
             override("paths.log_dir", log_dir),
             "hydra/sweeper=listed",
             override("hydra.sweeper.file", file),
             f"hydra/launcher={launcher}",
-            *limit,
+            *([f"{key}={at_once}"] if key and at_once else []),
             *settings,
             "--multirun",
         ]

@@ -4,35 +4,29 @@ import math
 import statistics
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.errors import ConfigError, DataError
-from qs3.report.tables.results import (
-    Runs,
-    Stat,
-    frame,
-    load_runs,
-    read_kept,
-    summarise,
-)
+from qs3.report.results import Runs, Stat, load_runs, read_kept, summarise
 from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
 from tests.report.made_runs import CATALOGUE, scores, write_run
 
 
 def runs(log_dir, take="final"):
     """The runs of the one config in a folder."""
-    (found,) = load_runs(log_dir).values()
-    return Runs(frame(found, take))
+    (found,) = (lines for key, lines in load_runs(log_dir).items() if key[2] == take)
+    return Runs(found)
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=9))
 def test_mean_and_sem_are_those_of_the_standard_library(values):
-    stat = Stat.of(values)
+    stat = Stat.of(pd.Series(values))
     assert stat.mean == pytest.approx(statistics.fmean(values), abs=1e-12)
     assert stat.sem == pytest.approx(statistics.stdev(values) / math.sqrt(len(values)), abs=1e-9)
-    assert Stat.of(values[:1]) == Stat(values[0], None, 1)
+    assert Stat.of(pd.Series(values[:1])) == Stat(values[0], None, 1)
 
 
 def test_groups_by_hash_not_by_seed(tmp_path):
@@ -41,7 +35,7 @@ def test_groups_by_hash_not_by_seed(tmp_path):
     write_run(tmp_path, hash="ffff0000", accuracy=0.9)
     found = load_runs(tmp_path)
     assert {key[1] for key in found} == {"0123abcd", "ffff0000"}
-    mine = Runs(frame(found["exp", "0123abcd"]))
+    mine = Runs(found["exp", "0123abcd", "final"])
     assert mine.seeds == [0, 1, 2]
     assert mine.stat("accuracy").percent() == "51.0 ± 0.6"
     assert mine.problems == []
@@ -87,7 +81,7 @@ def test_unfinished_and_damaged_seeds_are_shown(tmp_path):
 def test_runs_that_saw_other_data_are_not_averaged(tmp_path, changes):
     for seed in (0, 1):
         write_run(tmp_path, seed=seed)
-    assert runs(tmp_path).comparable
+    assert not runs(tmp_path).apart
     write_run(tmp_path, seed=2, **changes)
     assert runs(tmp_path).stat("accuracy") is None
     (said,) = runs(tmp_path).problems
@@ -140,7 +134,7 @@ def test_summary_of_a_multirun(tmp_path):
     assert lines[3].endswith("  45.0")  # a property of the data: no SEM
     assert "1 (!)" in lines[4]
     assert lines[5] == "exp ff00: no target labels, so no accuracy"
-    assert lines[6] == f"exp ff00, seed 1: no result ({tmp_path / 'exp' / 'seed1-ff00'})"
+    assert lines[6] == f"exp ff00, seed 1: unfinished ({tmp_path / 'exp' / 'seed1-ff00'})"
     assert lines[7] == "(!) fewer than 3 seeds"
 
 

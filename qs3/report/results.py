@@ -20,7 +20,7 @@ import gzip
 import hashlib
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,113 +42,94 @@ FEW_SEEDS = 3
 
 _NAMES = ("accuracy", "balanced_accuracy", "majority_rate")
 SCORES = (*_NAMES, *(f"{name}_{tier}" for tier in TIERS for name in _NAMES))
-COSTS = ("seconds", "core_seconds", "memory_gb", "gpu_memory_gb")
-_NUMBERS = (*SCORES, *COSTS)
-_FLAGS = ("simulated", "published", "diverged", "labelled")
-_FOLDER = re.compile(r"seed(\d+)-([0-9a-f]+)")
-_BLOCK = re.compile(r"(?:\w+_)?block\d+")  # as importers of frames name them
-_BEGUN = ("started.json", "last.ckpt", ".hydra")
+_COSTS = ("seconds", "core_seconds", "memory_gb", "gpu_memory_gb")
 _SEEN = {
     "source_data": "the source dataset differs",
     "target_data": "the target dataset differs",
     "weights": "the classifier that they began with differs",
 }
+_FLAGS = ("simulated", "published", "diverged", "labelled")
+_UNKNOWN: dict[str, Any] = {
+    **dict.fromkeys(("problem", "folder", "take", "called"), ""),
+    **dict.fromkeys(_FLAGS, False),
+    **dict.fromkeys((*SCORES, *_COSTS), np.nan),
+}
+"""Columns that every frame has, and what stands there where nothing is known."""
+
+NO_RUNS = pd.DataFrame([{"seed": 0, **dict.fromkeys(_SEEN, ""), **_UNKNOWN}])[:0]
+"""A frame without lines."""
+
+_FOLDER = re.compile(r"seed(\d+)-([0-9a-f]+)")
+_BLOCK = re.compile(r"(?:\w+_)?block\d+")  # as importers of frames name them
 MESHES, BLOCKS, ROOMS, CLOUDS = "meshes", "blocks of frames", "rooms", "clouds"
 """What test clouds of one cluster share; of `CLOUDS` it is not known, each counts by itself."""
 
 
-def record(metrics: RunMetrics, take: str = "final") -> dict[str, Any]:
+def record(metrics: RunMetrics, take: str) -> dict[str, Any]:
     """A line of the frame, without its place and predictions.
 
     Args:
         metrics: of a finished run.
         take: "final", or "warmup" for the scores of the teacher of round 0.
     """
-    final = take == "final"
+    final, made_of, rules = take == "final", metrics.made_of, metrics.selection
     tiers = (metrics.evaluation.tiers or {}) if final else {}
     scores = {"": metrics.final if final else metrics.warmup.selected.scores}
     scores |= {f"_{tier}": tiers[tier] for tier in TIERS if tier in tiers}
-    rules = metrics.selection
     return {
         "seed": metrics.seed,
         "experiment": metrics.experiment,
         "hash": metrics.hash,
-        "problem": "",
-        "take": take,
         "method": metrics.method,
         "selftraining": metrics.selftraining,
         "source": metrics.source,
         "target": metrics.target,
         "simulated": metrics.simulated,
-        "source_made_of": str(metrics.made_of.source),
-        "target_made_of": str(metrics.made_of.target),
+        "source_made_of": str(made_of.source),
+        "target_made_of": str(made_of.target),
         "data": "; ".join(f"{name}: {made}" for name, made in metrics.domains.items()),
         "published": all(made.published for made in metrics.domains.values()),
-        "meshes": metrics.made_of.source.meshes * (metrics.source != metrics.target),
-        **{
-            f"{role}_recipe": getattr(metrics.made_of, role).recipe for role in ("source", "target")
-        },
+        "meshes": made_of.source.meshes * (metrics.source != metrics.target),
+        "source_recipe": made_of.source.recipe,
+        "target_recipe": made_of.target.recipe,
         **{key: metrics.seen[key.removesuffix("_data")] for key in _SEEN},
         "teacher_selected": rules.teacher.split(", epoch")[0],
         "student_selected": (rules.student if final else rules.teacher).split(", epoch")[0],
         "diverged": metrics.diverged,
         "labelled": scores[""].accuracy is not None,
         **{f"{n}{tier}": getattr(s, n) for tier, s in scores.items() for n in _NAMES},
-        **{name: getattr(metrics.times, name) for name in COSTS},
+        **{name: getattr(metrics.times, name) for name in _COSTS},
     }
 
 
-def load_runs(log_dir: str | Path) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """All runs below a folder by experiment and hash, unfinished and damaged ones included.
+def load_runs(log_dir: str | Path) -> dict[tuple[str, str, str], pd.DataFrame]:
+    """All runs below a folder by experiment, hash and take, unfinished and damaged ones included.
 
-    Each is what `load_run` returns.
+    These have a `problem` and no scores.
     """
     root = Path(log_dir)
     folders = {path.parent for path in root.rglob(METRICS)}
     folders |= {p for p in root.rglob("seed*-*") if p.is_dir() and _FOLDER.fullmatch(p.name)}
     found = defaultdict(list)
     for folder in sorted(folders):
-        run = load_run(folder)
-        found[run["experiment"], run["hash"]].append(run)
-    return found
+        for line in load_run(folder):
+            found[line["experiment"], line["hash"], line["take"]].append(line)
+    return {key: pd.DataFrame(lines) for key, lines in found.items()}
 
 
-def load_run(folder: Path) -> dict[str, Any]:
-    """Metrics, folder and name of a run; with a `problem` in place of metrics if it has none."""
+def load_run(folder: Path) -> Iterator[dict[str, Any]]:
+    """A run's line of either take."""
     match = _FOLDER.fullmatch(folder.name)
     seed, config = (int(match[1]), match[2]) if match else (-1, "")
-    name = {"folder": folder, "experiment": folder.parent.name, "hash": config, "seed": seed}
+    named = {"seed": seed, "experiment": folder.parent.name, "hash": config}
+    metrics, problem = None, "unfinished"
     try:
         metrics = read_metrics(folder)
     except DataError as error:
-        return {**name, "problem": str(error)}
-    if metrics is None:
-        begun = any((folder / one).exists() for one in _BEGUN)
-        return {**name, "problem": "unfinished" if begun else "no result"}
-    return {
-        "folder": folder,
-        "metrics": metrics,
-        **{key: getattr(metrics, key) for key in ("experiment", "hash", "seed")},
-    }
-
-
-def frame(runs: Sequence[Mapping[str, Any]], take: str = "final") -> pd.DataFrame:
-    """Runs of `load_runs` as lines; those of unfinished runs have a `problem` and no scores."""
-    lines = [record(run["metrics"], take) if "metrics" in run else dict(run) for run in runs]
-    return complete(pd.DataFrame(lines).assign(folder=[str(run["folder"]) for run in runs]))
-
-
-def complete(lines: pd.DataFrame) -> pd.DataFrame:
-    """All columns there, with numbers and flags as such and "" for what is not known."""
-    columns = ("seed", "experiment", "hash", "problem", "folder", "take", *_NUMBERS)
-    lines = lines.reindex(columns=list(dict.fromkeys([*lines.columns, *columns, *_SEEN, *_FLAGS])))
-    for name in _NUMBERS:
-        lines[name] = pd.to_numeric(lines[name].replace("", np.nan))
-    for name in _FLAGS:
-        lines[name] = lines[name].astype(str) == "True"
-    others = [name for name in lines.columns if name not in (*_NUMBERS, *_FLAGS, "seed")]
-    lines[others] = lines[others].astype(object).fillna("")
-    return lines.astype({"seed": int})
+        problem = str(error)
+    for take in ("final", "warmup"):
+        line = named | {"problem": problem} if metrics is None else record(metrics, take)
+        yield line | _UNKNOWN | line | {"take": take, "folder": str(folder)}
 
 
 def write_kept(path: Path, lines: pd.DataFrame) -> None:
@@ -164,14 +145,21 @@ def read_kept(path: str | Path, target: str | None = None) -> dict[tuple[str, st
         ConfigError: there is no such file.
         DataError: it cannot be read, or is not one.
     """
+    numbers: dict[str, type] = {**dict.fromkeys((*SCORES, *_COSTS), float), "seed": int}
     try:
-        lines = pd.read_csv(path, dtype=str, keep_default_na=False)
-        lines = complete(lines)
+        lines = pd.read_csv(
+            path,
+            dtype=defaultdict[str, type](lambda: str, numbers),
+            keep_default_na=False,
+            na_values={name: [""] for name in numbers},
+        )
+        lines = lines.assign(**{name: of for name, of in _UNKNOWN.items() if name not in lines})
+        lines = lines.assign(**{name: lines[name].astype(str) == "True" for name in _FLAGS})
         lines = lines if target is None else lines[lines.target == target]
         return dict(iter(lines.groupby(["row", "column"], sort=False)))
     except FileNotFoundError as error:
         raise ConfigError(f"kept={path} is not there; `qs3 report keep` writes it") from error
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, AttributeError) as error:
         raise DataError(f"{path} cannot be read ({error})") from error
 
 
@@ -230,11 +218,10 @@ class Stat:
     n: int
 
     @staticmethod
-    def of(values: Sequence[float] | pd.Series) -> Stat:
+    def of(values: pd.Series) -> Stat:
         """From at least one value."""
-        series = pd.Series(values, dtype=float)
-        sem = float(series.sem()) if len(series) > 1 else None
-        return Stat(float(series.mean()), sem, len(series))
+        sem = float(values.sem()) if len(values) > 1 else None
+        return Stat(float(values.mean()), sem, len(values))
 
     def percent(self) -> str:
         """Such as "64.0 ± 1.0"; without a SEM for a single seed."""
@@ -259,20 +246,10 @@ class Runs:
         """Of the finished runs."""
         return self.finished.seed.tolist()
 
-    @property
-    def first(self) -> pd.Series | None:
-        """The first finished run, for what all seeds have in common."""
-        return None if self.finished.empty else self.finished.iloc[0]
-
     def stat(self, score: str) -> Stat | None:
         """Mean of one of `SCORES` over seeds; None if nothing may be averaged."""
         values = self.finished[score]
-        return None if values.empty or values.isna().any() or self._apart else Stat.of(values)
-
-    @property
-    def comparable(self) -> bool:
-        """Whether the finished runs may be averaged."""
-        return not self._apart
+        return None if values.empty or values.isna().any() or self.apart else Stat.of(values)
 
     @property
     def problems(self) -> list[str]:
@@ -281,10 +258,11 @@ class Runs:
         found = [f"seed {r.seed}: {r.problem} ({r.folder})" for r in failed.itertuples()]
         if diverged := _list(self.finished[self.finished.diverged].seed):
             found.append(f"seeds {diverged}: the net has diverged, one class for all: averaged")
-        return [*found, *self._apart]
+        return [*found, *self.apart]
 
     @cached_property
-    def _apart(self) -> list[str]:
+    def apart(self) -> list[str]:
+        """Why the finished seeds may not be averaged; [] if they may."""
         found = []
         if not (twice := self.finished[self.finished.seed.duplicated(keep=False)]).empty:
             places = ", ".join(twice.folder)
@@ -304,18 +282,13 @@ def same_data(lines: pd.DataFrame, key: str) -> bool:
     return lines[key].nunique() < 2 or bool(one_recipe and recipes.iloc[0])
 
 
-def _list(seeds: Iterable[int]) -> str:
+def _list(seeds: pd.Series | np.ndarray) -> str:
     return ", ".join(map(str, seeds))
-
-
-def task(run: Any) -> str:
-    """Such as "specklenet10 -> kinectsim10 (simulated target)"."""
-    return f"{run.source} -> {run.target}{' (simulated target)' if run.simulated else ''}"
 
 
 def data_lines(lines: pd.DataFrame) -> list[str]:
     """What the data of runs are made of: "data: specklenet10: embedded catalogue, ..."; once."""
-    parts = [part for text in lines.get("data", ()) for part in str(text).split("; ") if part]
+    parts = [part for text in lines.get("data", ()) for part in text.split("; ") if part]
     return [f"data: {part}" for part in dict.fromkeys(parts)]
 
 
@@ -325,26 +298,30 @@ def summarise(folders: Sequence[Path], settings: Mapping[Path, str] | None = Non
     What could not be averaged follows below it. `settings`: by folder how a config differs from
     the others.
     """
-    lines = frame([load_run(folder) for folder in folders])
-    lines["settings"] = [(settings or {}).get(Path(folder), "") for folder in lines.folder]
-    several = bool((lines.settings != "").any())
-    header = ["experiment", *["settings"] * several, "source -> target", "method"]
-    rows = [[*header, "self-training", "accuracy", "balanced", "seeds", "majority"]]
-    notes: list[str] = []
-    for key, some in lines.groupby(["experiment", "hash"], sort=False):
+    differing = [(settings or {}).get(folder, "") for folder in folders]
+    lines = pd.DataFrame([next(load_run(folder)) for folder in folders])
+    rows, notes = [], []
+    for key, some in lines.assign(settings=differing).groupby(["experiment", "hash"], sort=False):
         runs = Runs(some)
-        first, few = runs.first, 0 < len(runs.seeds) < FEW_SEEDS
-        about = ["?"] * 3 if first is None else [task(first), first.method, first.selftraining]
+        about = ["?"] * 3
+        if runs.seeds:
+            first = runs.finished.iloc[0]
+            mark = " (simulated target)" * bool(first.simulated)
+            about = [f"{first.source} -> {first.target}{mark}", first.method, first.selftraining]
         stats = [runs.stat(name) for name in _NAMES]
         accuracy, balanced = (stat.percent() if stat else "-" for stat in stats[:2])
         majority = f"{100 * stats[2].mean:.1f}" if stats[2] else "-"
-        seeds = f"{len(runs.seeds)}{' (!)' if few else ''}"
-        shown = [some.settings.iloc[0] or "-"] * several
-        rows.append([some.experiment.iloc[0], *shown, *about, accuracy, balanced, seeds, majority])
-        name = " ".join(map(str, key))
-        if first is not None and not first.labelled:
+        few = " (!)" * (0 < len(runs.seeds) < FEW_SEEDS)
+        shown = (accuracy, balanced, f"{len(runs.seeds)}{few}", majority)
+        rows.append([key[0], some.settings.iloc[0] or "-", *about, *shown])
+        name = " ".join(key)
+        if not runs.finished.empty and not runs.finished.labelled.any():
             notes.append(f"{name}: no target labels, so no accuracy")
-        notes += [f"{name}, {said}" for said in runs.problems]
+        notes += [f"{name}, {words}" for words in runs.problems]
+    header = ["experiment", "settings", "source -> target", "method", "self-training"]
+    header += ["accuracy", "balanced", "seeds", "majority"]
     notes += [f"(!) fewer than {FEW_SEEDS} seeds"] * any("(!)" in row[-2] for row in rows)
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
-    return "\n".join([caption, *aligned(rows), *notes, *data_lines(lines)])
+    return "\n".join(
+        [caption, *aligned([header, *rows]), *notes, *data_lines(lines[lines.problem == ""])]
+    )

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from qs3.config.hashing import config_hash
-from qs3.report.tables.table import build_table
+from qs3.report.table import build_table
 from qs3.runs.predictions import FILE, Predictions, write_predictions
 from tests.composing import compose
 from tests.report.made_runs import write_run

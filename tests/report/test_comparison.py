@@ -3,13 +3,13 @@
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.report.tables.comparison import against, effects, text
-from qs3.report.tables.results import write_kept
-from qs3.report.tables.table import build_table, kept_lines
+from qs3.report.comparison import against, effects, text
+from qs3.report.results import write_kept
+from qs3.report.table import build_table, kept_lines
 from qs3.runs.metrics import DataHashes, Evaluated
 from qs3.runs.predictions import FILE, write_predictions
+from tests.report.filled import PLACE, fill, predictions, run_cell
 from tests.report.made_runs import scores
-from tests.report.tables.filled import PLACE, fill, predictions, run_cell
 
 SMALL = f"""
 title: Small
@@ -105,16 +105,6 @@ def test_other_targets_are_not_compared(tmp_path):
     table = fill(tmp_path, str(tmp_path / "small.yaml"), {"DANN": 12}, changes=changes)
     (one,) = (one for one in against(table, "source only") if one.name == "DANN")
     assert "different targets" in one.why
-
-
-def test_runs_are_not_compared_with_themselves(tmp_path):
-    """Overrides may make two rows one."""
-    lines = ("title: t", "metrics: [accuracy]", f"columns: [{PLACE}]", "rows:")
-    rows = (f"  - {{name: {name}, run: experiment=qs3_s2d selftraining=none}}" for name in "ab")
-    (tmp_path / "own.yaml").write_text("\n".join([*lines, *rows]))
-    table = fill(tmp_path, str(tmp_path / "own.yaml"), {"a": 10})
-    (one,) = against(table, "a")
-    assert "the same runs" in one.why
 
 
 def test_effects_of_crossed_factors(tmp_path):

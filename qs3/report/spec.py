@@ -28,7 +28,6 @@ from qs3.errors import ConfigError
 _STRICT = ConfigDict(extra="forbid")
 _Percent = Annotated[float, Interval(ge=0, le=100)]
 _SHARED = ("selected", "source", "take", "first")  # keys of cells that a row may have for all
-_Number = _Percent | tuple[_Percent, _Percent]
 
 Metric = Literal[
     "accuracy", "balanced_accuracy",
@@ -52,22 +51,23 @@ class Entry:
     """
 
     run: str | None = None
-    paper: _Number | None = None
+    paper: _Percent | tuple[_Percent, _Percent] | None = None
     selected: str = ""
     source: str = ""
     take: Literal["final", "warmup"] = "final"
     first: bool = False
 
     @property
-    def mean(self) -> float | None:
-        """The published number."""
-        return self.paper[0] if isinstance(self.paper, tuple) else self.paper
+    def numbers(self) -> tuple[float, ...]:
+        """The published number, and its SEM if it has one; () if there is none."""
+        if self.paper is None:
+            return ()
+        return self.paper if isinstance(self.paper, tuple) else (self.paper,)
 
     @property
     def published(self) -> str:
         """Such as "72.4 ± 0.8"; "" if there is none."""
-        parts = self.paper if isinstance(self.paper, tuple) else (self.paper,)
-        return " ± ".join(f"{part:.1f}" for part in parts if part is not None)
+        return " ± ".join(f"{number:.1f}" for number in self.numbers)
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -100,25 +100,15 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Spec:
-    """A table's file.
-
-    Attributes:
-        layout: "benchmark": published numbers on lines of their own, with how they were selected,
-            and an average over the columns.
-    """
+    """A table's file; with `averages` it has a column of averages over all others."""
 
     title: str
     metrics: Annotated[list[Metric], MinLen(1)]
     columns: dict[str, _Column | None]
     rows: list[Row]
-    layout: Literal["", "benchmark"] = ""
+    averages: bool = False
     notes: list[str] = field(default_factory=list)
     sources: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def rows_have_targets(self) -> bool:
-        """Whether columns have no overrides, so that one target can be given for all of them."""
-        return all(column is not None and not column.run for column in self.columns.values())
 
 
 def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[str, Spec]:
@@ -134,9 +124,12 @@ def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[s
     path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
     try:
         plain = yaml.safe_load(path.read_text(encoding="utf-8"))
-        plain["columns"] = _columns(plain["columns"])
-        rows = [*plain["rows"], *map(dict, more_rows)]
-        plain["rows"] = [_row(row, plain) for row in rows]
+        columns = plain["columns"]
+        columns = dict.fromkeys(columns, "") if isinstance(columns, list) else columns
+        plain["columns"] = {
+            name: {"run": run} if isinstance(run, str) else run for name, run in columns.items()
+        }
+        plain["rows"] = [_row(row, plain) for row in [*plain["rows"], *more_rows]]
         spec = TypeAdapter(Spec).validate_python(plain)
         if twice := [name for name, n in Counter(r.name for r in spec.rows).items() if n > 1]:
             raise ValueError(f"two rows are called {twice[0]!r}")
@@ -146,12 +139,6 @@ def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[s
     except (yaml.YAMLError, TypeError, KeyError, ValueError, AttributeError) as error:
         raise ConfigError(f"{path}: missing or wrong entry: {error}") from error
     return path.stem, spec
-
-
-def _columns(given: Any) -> dict[str, Any]:
-    if isinstance(given, list):
-        given = dict.fromkeys(given, "")
-    return {name: {"run": run} if isinstance(run, str) else run for name, run in given.items()}
 
 
 def _row(row: Mapping[str, Any], spec: Mapping[str, Any]) -> dict[str, Any]:
@@ -173,7 +160,7 @@ def _row(row: Mapping[str, Any], spec: Mapping[str, Any]) -> dict[str, Any]:
     return {**row, "cells": cells}
 
 
-def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, list[str]]:
     """The overrides of each column, in the order of `words`.
 
     A word such as "R->A,R->A0:data.target.published.file=FILE" is for these columns alone.
@@ -183,29 +170,26 @@ def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[s
         named, colon, override = word.partition(":")
         if not colon or "=" in named:  # a colon of a value
             named, override = "", word
-        for column in chosen(columns, named.split(",") if named else [], f"overrides: {word}: "):
+        for column in chosen(columns, named.split(",") if named else []):
             found[column].append(override)
-    return {column: tuple(own) for column, own in found.items()}
+    return found
 
 
-def chosen(names: Iterable[str], words: Sequence[str], place: str = "") -> list[str]:
+def chosen(names: Iterable[str], words: Sequence[str]) -> list[str]:
     """Names that are meant by the words: the one that is the word, else all that contain it.
 
     Case and spaces do not count, and an arrow may be typed as "->". No words mean all names.
 
     Raises:
-        ConfigError: a word means no name; begins with `place`.
+        ConfigError: a word means no name.
     """
-    names = list(names)
-    meant: set[str] = set() if words else set(names)
-    for word in words:
-        exact = [name for name in names if _plain(name) == _plain(word)]
-        found = exact or [name for name in names if _plain(word) in _plain(name)]
+    plain = {name: re.sub(r"\s", "", name.lower().replace("→", "->")) for name in names}
+    meant: set[str] = set() if words else {*plain}
+    for given in words:
+        word = re.sub(r"\s", "", given.lower().replace("→", "->"))
+        found = [name for name in plain if plain[name] == word]
+        found = found or [name for name in plain if word in plain[name]]
         if not found:
-            raise ConfigError(f"{place}no name has {word!r}; there are {', '.join(names)}")
+            raise ConfigError(f"no name has {given!r}; there are {', '.join(plain)}")
         meant.update(found)
-    return [name for name in names if name in meant]
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"\s", "", name.lower().replace("→", "->"))
+    return [name for name in plain if name in meant]

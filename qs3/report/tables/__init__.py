@@ -1,1 +1,0 @@
-"""Tables of runs: cells, statistics, formats, paired comparisons."""
