@@ -1,6 +1,5 @@
 """Domains as Hydra makes them from conf/domain, on fixtures in the published formats."""
 
-import multiprocessing
 import subprocess
 import sys
 from pathlib import Path
@@ -14,8 +13,7 @@ from qs3.classes import CLASSES
 from qs3.commands.download import scannet
 from qs3.config.hydra import build
 from qs3.datasets import domain as module
-from qs3.datasets.domain import Domain, check_or_make
-from qs3.datasets.published import PublishedTree
+from qs3.datasets.domain import check_or_make
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.commands import parse
 from tests.composing import compose
@@ -94,19 +92,6 @@ def test_changed_import_settings_are_noticed(tmp_path):
         domain("scannet10", tmp_path, "published.form=mirrored", f"path={found.path}").open()
     mirrored = domain("scannet10", tmp_path, "published.form=mirrored").open()
     np.testing.assert_array_equal(mirrored.points * np.float32([1, -1, 1]), data.points)
-
-
-def _open(data_dir):
-    published = PublishedTree(data_dir / "published" / "depthscannet10")
-    return Domain("d", "D", "D", data_dir / "d", published=published).open().sha256
-
-
-@pytest.mark.slow
-def test_processes_that_open_at_once_import_once(tmp_path):
-    fixtures.write_domain("depthscannet10", tmp_path, SPLITS)
-    with multiprocessing.get_context("spawn").Pool(3) as pool:
-        assert len(set(pool.map(_open, [tmp_path] * 3))) == 1
-    assert not (tmp_path / ".d.importing").exists()
 
 
 def test_importing_is_light():

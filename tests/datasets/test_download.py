@@ -72,7 +72,7 @@ def zipped(folder):
 def speckle(tmp_path_factory):
     """SpeckleNet10 as an archive with a folder too many, a list and Mac OS's companions."""
     folder = tmp_path_factory.mktemp("author")
-    fixtures.write_xyz_tree(folder / "sim2real" / "raw_pc_multiview_point_at", SPLITS)
+    fixtures.write_tree(folder / "sim2real" / "raw_pc_multiview_point_at", SPLITS)
     (folder / "sim2real" / "list.txt").write_text("a list")
     (folder / "__MACOSX").mkdir()
     (folder / "__MACOSX" / "._list.txt").write_text("")
@@ -142,9 +142,9 @@ def test_scannet_needs_an_agreement(site, tmp_path, speckle):
 
 def test_pointda_is_taken_apart(site, tmp_path, tmp_path_factory):
     folder = tmp_path_factory.mktemp("author") / "PointDA_data"
-    fixtures.write_npy_tree(folder / "modelnet", SPLITS)
+    fixtures.write_tree(folder / "modelnet", SPLITS, ".npy")
     three = {"validation": 1, **SPLITS}
-    fixtures.write_npy_tree(folder / "shapenet", three, points=1024, up="y")
+    fixtures.write_tree(folder / "shapenet", three, ".npy", points=1024, up="y")
     fixtures.write_pointda_h5(folder / "scannet", SPLITS)
     with tarfile.open(site.folder / "pointda10.zip", "w:gz") as archive:
         archive.add(folder, "PointDA_data")
@@ -157,13 +157,13 @@ def test_pointda_is_taken_apart(site, tmp_path, tmp_path_factory):
 
 def test_archives_with_no_tree_or_several(site, tmp_path, tmp_path_factory):
     folder = tmp_path_factory.mktemp("author")
-    fixtures.write_npy_tree(folder / "a", SPLITS)
+    fixtures.write_tree(folder / "a", SPLITS, ".npy")
     (site.folder / "specklenet10.zip").write_bytes(zipped(folder))
     with pytest.raises(DataError, match="specklenet10"):
         get(site, "specklenet10", tmp_path)
     assert visible(tmp_path / "published") == []
     for name in ("noisy", "clean"):
-        fixtures.write_xyz_tree(folder / name, SPLITS)
+        fixtures.write_tree(folder / name, SPLITS)
     (tmp_path / "own.zip").write_bytes(zipped(folder))
     words = ["download", "specklenet10", f"into={tmp_path}", f"archive={tmp_path / 'own.zip'}"]
     assert main(words) == 1

@@ -13,13 +13,10 @@ from qs3.datasets.domain import Domain
 from qs3.datasets.importing import check_cloud, import_into
 from qs3.datasets.published import GraspNetPC, NamedArrays, PointDAH5, PublishedTree
 from qs3.errors import DataError
-from qs3.store.meta import ManifestRow, is_finished
+from qs3.store.meta import ManifestRow
 from qs3.store.store import open_pointset, write_pointset
 from qs3.training.load import _objects_by_id
-from tests.datasets.test_domain import domain
-from tests.fixtures import published as fixtures
 
-SPLITS = {"train": 2, "test": 1}
 TWO = ("bed", "chair")
 
 
@@ -70,27 +67,11 @@ def test_npy_axes(tmp_path):
     assert plant.tolist() == cloud.tolist()
 
 
-def h5_file(path, n=2, points=4, **changes):
-    content = {
-        "data": np.arange(n * points * 6, dtype="f4").reshape(n, points, 6),
-        "label": np.arange(n, dtype="i4")[:, None],
-        **changes,
-    }
-    with h5py.File(path, "w") as file:
-        for key, value in content.items():
-            if value is not None:
-                file[key] = value
-
-
-def h5_folder(folder, **changes):
-    folder.mkdir(exist_ok=True)
-    for name in ("train_0", "train_1", "test_0"):
-        h5_file(folder / f"{name}.h5", **changes)
-    return folder
-
-
 def test_h5_axes_and_mirror(tmp_path):
-    h5_folder(tmp_path)
+    for name in ("train_0", "train_1", "test_0"):
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file["data"] = np.arange(2 * 4 * 6, dtype="f4").reshape(2, 4, 6)
+            file["label"] = np.arange(2, dtype="i4")[:, None]
     (tmp_path / "test_0.h5").rename(tmp_path / "test_1.h5")
     assert PointDAH5(tmp_path).is_there()
     (tmp_path / "test_1.h5").rename(tmp_path / "away")
@@ -108,20 +89,15 @@ def test_h5_axes_and_mirror(tmp_path):
     assert rows[3].origin == "train_1.h5[1]"
 
 
-def npz(folder, **changes):
-    content = {
-        "points": np.arange(4 * 2 * 3, dtype="f4").reshape(4, 2, 3),
-        "cls": np.array(["bed", "chair", "bed", "chair"]),
-        "split": np.array(["test", "train", "train", "test"]),
-        "name": np.array(["a", "b", "c", "d"]),
-        **changes,
-    }
-    np.savez(folder / "points.npz", **{k: v for k, v in content.items() if v is not None})
-    return folder
-
-
 def test_named_arrays(tmp_path):
-    clouds, rows = NamedArrays(npz(tmp_path), points=2).read(TWO, tmp_path)
+    np.savez(
+        tmp_path / "points.npz",
+        points=np.arange(4 * 2 * 3, dtype="f4").reshape(4, 2, 3),
+        cls=["bed", "chair", "bed", "chair"],
+        split=["test", "train", "train", "test"],
+        name=["a", "b", "c", "d"],
+    )
+    clouds, rows = NamedArrays(tmp_path, points=2).read(TWO, tmp_path)
     assert [r.id for r in rows] == ["bed/train/c", "chair/train/b", "bed/test/a", "chair/test/d"]
     assert [cloud[0, 0] for cloud in clouds] == [12, 6, 0, 18]
 
@@ -225,25 +201,3 @@ def test_which_clouds_show_the_same_object(tmp_path):
     for published, more in ((None, {}), (tree, {rows[0].id: "scene0001"})):
         made = Domain("d", "D", "D", tmp_path / "x", published=published, classes=["bed"])
         assert _objects_by_id(data, made) == known | more
-
-
-_FULL = """
-import resource, sys
-from tests.datasets.test_domain import domain
-from qs3.errors import Qs3Error
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-try:
-    domain("scannet10", sys.argv[1]).open()
-except Qs3Error:
-    sys.exit(3)
-"""
-
-
-def test_a_full_disk_leaves_nothing_that_opens(tmp_path):
-    """With a limit on the size of files, a write fails as it does on a full disk."""
-    fixtures.write_domain("scannet10", tmp_path, SPLITS)
-    done = subprocess.run([sys.executable, "-c", _FULL, str(tmp_path)], check=False)
-    assert done.returncode == 3
-    assert not is_finished(tmp_path / "scannet10_real")
-    data = domain("scannet10", tmp_path).open()  # with room, the same command completes it
-    assert open_pointset(tmp_path / "scannet10_real").sha256 == data.sha256

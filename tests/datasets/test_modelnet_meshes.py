@@ -1,16 +1,13 @@
 """ModelNet from its meshes: the same as through PyG where PyG is right, and errors where not."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from qs3.classes import CLASSES
 from qs3.datasets.published import ModelNetMeshes
-from tests.fixtures.modelnet import off_text, write_off_tree
+from tests.fixtures.modelnet import write_off_tree
 
 SPLITS = {"train": 2, "test": 1}
-ARRAYS = Path(__file__).parents[3] / "shared" / "data" / "modelnet10_points.npz"
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +46,3 @@ def test_a_cloud_depends_on_its_own_seed_only(modelnet, tmp_path):
     fewer, _ = read(tmp_path, points=32)
     assert len(fewer) == 20
     assert all(np.array_equal(first[key], fewer[key]) for key in fewer)
-
-
-SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 1.5, 0]])
-GOOD = off_text(SQUARE, [[0, 1, 2], [0, 2, 3]])

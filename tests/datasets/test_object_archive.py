@@ -1,6 +1,4 @@
-"""An archive of cut objects: parts, folds, stray points; and the real one, where it is at hand."""
-
-from pathlib import Path
+"""An archive of cut objects: parts, folds, stray points."""
 
 import numpy as np
 import pytest
@@ -10,13 +8,6 @@ from qs3.datasets.domain import compose_domain
 from qs3.errors import ConfigError, DataError
 from qs3.store.meta import is_finished, read_manifest
 from tests.fixtures.frame_files import write_archive
-
-FOUND = [
-    path
-    for base in Path(__file__).parents
-    for path in [base / "shared" / "data" / "nyuv2_objects" / "nyuv2_train_objects.npz"]
-    if path.is_file()
-]
 
 
 @pytest.fixture(scope="module")

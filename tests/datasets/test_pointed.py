@@ -134,16 +134,20 @@ def test_up_is_fitted_or_level_and_says_which():
     assert [caution.kind for caution in down.cautions] == ["up"]
 
 
+@pytest.mark.parametrize("size", [(480, 640), (120, 160)])
 @pytest.mark.parametrize("pitch_deg", [0, 15, 30, 45, 55, 70, 85])
-def test_a_fitted_vertical_is_right_or_not_sure(pitch_deg):
+def test_a_fitted_vertical_is_right_or_not_sure(pitch_deg, size):
     """A wall seen steeply from above looks like a floor: what is wrong must not be sure."""
+    camera = tuple(size[0] / 480 * value for value in ROOM.camera)
     shot = Shot(
         [Thing("chair", -0.3, 2.4 if pitch_deg < 40 else 1.6, 35)],
         pitch_deg=pitch_deg,
         roll_deg=4,
         height_m=1.4 + pitch_deg / 60,
+        size=size,
+        camera=camera,
     )
-    up, sure = planes_up_steep(seen(shot)[0], CAMERA)
+    up, sure = planes_up_steep(seen(shot)[0], Pinhole(*camera))
     right = angle_deg(up, shot.up_in_camera) < 1.5
     assert right or not sure
     assert right or pitch_deg > 50

@@ -1,14 +1,7 @@
 """From rendered rooms in ScanNet's formats to clouds on their objects."""
 
 import hashlib
-import os
-import random
 import shutil
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,11 +17,9 @@ from qs3.errors import DataError
 from qs3.store.meta import read_manifest
 from qs3.store.store import open_pointset
 from tests.datasets.conftest import LOST
-from tests.datasets.rooms import write_lists, write_scene
 from tests.datasets.writing import ID_OF, write_zip
 from tests.running import main
 
-ROOT = Path(__file__).resolve().parents[2]
 TRAIN, VAL = "scene0001_00", "scene0007_01"
 
 
@@ -159,48 +150,3 @@ def test_the_command(written, finished, tmp_path, capsys):
     assert open_pointset(tmp_path / "d").sha256 == finished[1].sha256
     assert main(command(written, tmp_path / "e", "views=none")) == 1
     assert "views" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("victim", ["parent", "worker"])
-def test_kill_at_random_instants_changes_no_byte(recorded, tmp_path, victim):
-    """SIGKILL again and again, until it gets through."""
-    names = [f"scene{i:04d}_00" for i in range(12)]
-    one, other = recorded.values()
-    for i, name in enumerate(names):
-        write_scene(tmp_path / "scans", name, *(one if i % 2 else other))
-    write_lists(tmp_path, names[:8], names[8:])
-    out = tmp_path / "killed" / "depthscannet10"
-    whole = run(tmp_path, tmp_path / "whole").sha256
-    words = [sys.executable, "-m", "qs3", *command(tmp_path, out, "workers=2")]
-    chance = random.Random(victim)
-    kills = 0
-    for _ in range(60):
-        process = subprocess.Popen(
-            words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        if kills < 12:
-            time.sleep(chance.uniform(0.3, 3.5))
-            kills += _kill(process.pid if victim == "parent" else _a_child(process.pid))
-        if process.wait(timeout=120) == 0:  # a hung run is a failure, too
-            assert open_pointset(out).sha256 == whole
-            if kills >= 10:
-                break
-            shutil.rmtree(out)
-    else:
-        pytest.fail("it never finished")
-    assert not list(out.rglob("*.tmp*"))
-
-
-def _a_child(pid):
-    found = Path(f"/proc/{pid}/task/{pid}/children")
-    children = found.read_text().split() if found.exists() else []
-    return int(children[-1]) if children else None
-
-
-def _kill(pid):
-    try:
-        os.kill(pid, signal.SIGKILL)
-    except (ProcessLookupError, TypeError):
-        return 0
-    return 1

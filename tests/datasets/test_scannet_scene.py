@@ -94,38 +94,11 @@ def test_masks_of_another_shape_are_refused():
         Registration(header(), (96, 96))
 
 
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), wide=st.booleans())
-def test_agreement_is_that_of_the_twin(seed, wide):
-    rng = np.random.default_rng(seed)
-    coarse = rng.integers(0, 4, (4, 5))
-    mask = np.kron(coarse, np.ones((3, 4))).astype(np.uint16 if wide else np.uint8)
-    if wide:
-        mask *= 300
-    expected = np.zeros_like(mask)
-    for row in range(mask.shape[0]):
-        for col in range(mask.shape[1]):
-            near = mask[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2]
-            expected[row, col] = mask[row, col] if (near == mask[row, col]).all() else 0
+def test_a_mask_s_edges_are_left_out():
+    mask = np.array([[1, 1, 1, 2, 2, 2, 2]] * 4, dtype=np.uint16) * 300
     found = agreed(mask)
     assert found.dtype == mask.dtype
-    np.testing.assert_array_equal(found, expected)
-
-
-def circle(degrees, radius=2.0):
-    angle = np.deg2rad(degrees)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
-
-
-def test_the_directions_taken_are_far_apart():
-    """A long stay in one corner, a quick walk about: the stay gets one viewpoint, not eight."""
-    degrees = np.concatenate([np.linspace(0, 3, 80), np.arange(45, 360, 45)])
-    points = np.full(len(degrees), 2000)
-    points[7] = 5000
-    chosen = spread(circle(degrees), points, 8)
-    assert chosen[0] == 7
-    assert sum(i < 80 for i in chosen) == 1
-    assert sorted(chosen[1:]) == list(range(80, 87))
+    np.testing.assert_array_equal(found, np.array([[1, 1, 0, 0, 2, 2, 2]] * 4) * 300)
 
 
 @settings(max_examples=100, deadline=None)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from qs3.datasets.depth_images import Pinhole
-from qs3.datasets.vertical import angle_deg, floor_up, planes_up, planes_up_steep
+from qs3.datasets.vertical import angle_deg, floor_up, planes_up
 from tests.fixtures.frame_files import Shot, Thing, kinect
 
 TILTS = [(5, 0), (14, 3), (25, -4), (-3, 6)]
@@ -38,22 +38,3 @@ def test_planes(pitch, roll):
     up = planes_up(kinect(one.render()[0], 1), Pinhole(*one.camera))
     assert angle_deg(up, one.up_in_camera) < 2.5
     assert planes_up(np.zeros((60, 80)), Pinhole(*one.camera)) is None
-
-
-@pytest.mark.parametrize("pitch", [10, 20, 30])
-@pytest.mark.parametrize("width", [640, 160])
-def test_planes_of_small_pictures(width, pitch):
-    """A floor 1.2 m below the camera and a wall 4.5 m before it, by a camera of 63 degrees."""
-    height, focal = width * 3 // 4, 525 * width / 640
-    camera = Pinhole(focal, focal, (width - 1) / 2, (height - 1) / 2)
-    angle = np.deg2rad(pitch)
-    up, ahead = np.array([0, -np.cos(angle), -np.sin(angle)]), [0, -np.sin(angle), np.cos(angle)]
-    rays = camera.rays(height, width)
-    floor, wall = 1.2 / np.maximum(-(rays @ up), 1e-9), 4.5 / np.maximum(rays @ ahead, 1e-9)
-    depth = np.minimum(floor, wall)
-    rng = np.random.default_rng(0)
-    depth += 0.005 * rng.normal(size=depth.shape)
-    depth[rng.random(depth.shape) < 0.05] = 0  # all over the picture, mostly single pixels
-    found, sure = planes_up_steep(depth, camera)
-    assert sure
-    assert angle_deg(found, up) < 1

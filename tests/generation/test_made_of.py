@@ -12,7 +12,7 @@ from qs3.generation.command import generate
 from qs3.generation.made_of import made_of
 from qs3.generation.plan import planned
 from qs3.store.meta import is_finished
-from tests.fixtures.published import write_xyz_tree
+from tests.fixtures.published import write_tree
 from tests.generation.generating import QUICK, composed, config
 
 FAST = [*QUICK[:-1], "views=1", "renderer.samples=1", "workers=0"]
@@ -101,7 +101,7 @@ def test_a_preset_beside_conf_has_the_name_of_its_file(tmp_path):
 
 
 def test_an_imported_dataset_is_never_replaced(meshes, tmp_path):
-    write_xyz_tree(tmp_path / "published" / "specklenet10", {"train": 1, "test": 1})
+    write_tree(tmp_path / "published" / "specklenet10", {"train": 1, "test": 1})
     before = domain("specklenet10", tmp_path).open().sha256
     one = ["workers=0", "limit=1", "classes=[chair]", "domain.published=null"]
     for force in ("true", "false"):
@@ -111,7 +111,7 @@ def test_an_imported_dataset_is_never_replaced(meshes, tmp_path):
 
 
 def test_the_clean_twin_is_made_beside_the_published_dataset(meshes, tmp_path):
-    write_xyz_tree(tmp_path / "published" / "specklenet10", {"train": 1, "test": 1})
+    write_tree(tmp_path / "published" / "specklenet10", {"train": 1, "test": 1})
     before = domain("specklenet10", tmp_path).open().sha256
     one = ["workers=0", "limit=1", "classes=[chair]"]
     made = generate(config(tmp_path, meshes, *one, domain="specklenet10_clean"))
