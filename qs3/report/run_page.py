@@ -29,7 +29,8 @@ from qs3.runs import folder as runs
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
-from qs3.store.store import PointSet, is_finished
+from qs3.store.meta import is_finished
+from qs3.store.store import PointSet
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.page import confusion_rows, render
 from qs3.utils.pictures import save_png
