@@ -22,11 +22,10 @@ import pandas as pd
 
 from qs3.calibration import edges, planes
 from qs3.calibration.subject import Subject, load
-from qs3.calibration.walls import TRIMMED_NORMAL
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from qs3.utils.files import make_folder, write_text
-from qs3.utils.progress import progress_bar
+from qs3.utils.progress import shown
 
 DEFAULT_SENSORS = (
     "kinect_v1", "structure_sensor", "realsense_d415", "realsense_d435", "speckle_stereo",
@@ -36,7 +35,7 @@ DEFAULT_SENSORS = (
 
 PLANES = (
     "sensor", "depth_m", "tilt_deg", "recedes", "pixels", "fill", "sigma_m", "bias_m", "accuracy",
-    "subpixel_rms_px", "bias_px", "correlation_px", "law_m",
+    "subpixel_rms_px", "bias_px", "correlation_px",
 )  # fmt: skip
 """Columns of planes.csv; see `planes.measure`."""
 
@@ -71,16 +70,6 @@ _NGUYEN_M = (1.0, 1.5, 2.0, 3.0, 4.0)
 _Row = tuple[str, float, float, float]  # of a band: what, value, low, high
 
 
-def nguyen_axial_m(depth_m: np.ndarray | float) -> np.ndarray:
-    """Axial noise of Kinect v1 up to 60 degrees (Nguyen, Izadi and Lovell, 3DIMPVT 2012)."""
-    return 0.0012 + 0.0019 * (np.asarray(depth_m, dtype=np.float64) - 0.4) ** 2
-
-
-def kotsonis_d435_m(depth_m: np.ndarray | float) -> np.ndarray:
-    """Axial noise of a D435 as measured by L. Kotsonis (elevation_mapping, 0.2 to 3.25 m)."""
-    return 0.000611 + 0.003587 * (np.asarray(depth_m, dtype=np.float64) - 0.3515) ** 2
-
-
 def conditions(subject: Subject, quick: bool = False) -> list[tuple[float, float, bool, int, int]]:
     """For `planes.measure`: all distances, and tilted both ways at the one nearest to 2 m."""
     fineness = (8, 16) if quick else (16, 24)
@@ -97,15 +86,9 @@ def run(
     """Measure sensors by their names and write the files; returns all bands."""
     subjects = [load(name, overrides) for name in names or DEFAULT_SENSORS]
     folder, renderer = make_folder(out), MitsubaRenderer(samples=samples)
-    rows, squares = [], []
-    total = sum(len(conditions(subject, quick)) + 1 for subject in subjects)
-    with progress_bar("conditions", total=total) as advance:
-        for subject in subjects:
-            for condition in conditions(subject, quick):
-                rows.append(planes.measure(subject, renderer, *condition))
-                advance()
-            squares.append(edges.measure(subject, renderer, 3 if quick else 8))
-            advance()
+    jobs = [(subject, each) for subject in subjects for each in conditions(subject, quick)]
+    rows = [planes.measure(s, renderer, *each) for s, each in shown(jobs, "planes")]
+    squares = [edges.measure(s, renderer, 3 if quick else 8) for s in shown(subjects, "edges")]
     return write(subjects, pd.DataFrame(rows, columns=PLANES), pd.DataFrame(squares), folder)
 
 
@@ -121,16 +104,16 @@ def write(
     for name, rows in (("planes", flat), ("edges", square), ("bands", table)):
         write_text(folder / f"{name}.csv", rows.to_csv(index=False, float_format="%.6g"))
     template = files("qs3.calibration").joinpath("bench.md").read_text("utf-8")
-    shown = [_shown(s.name, flat[flat.sensor == s.name], bands) for s in subjects]
+    lines = [_line(s.name, flat[flat.sensor == s.name], bands) for s in subjects]
     page = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True)
     text = page.from_string(template).render(
-        sensors=shown, bands=bands, depths_m=_SHOWN_M, tilts_deg=_SHOWN_DEG
+        sensors=lines, bands=bands, depths_m=_SHOWN_M, tilts_deg=_SHOWN_DEG
     )
     write_text(folder / "index.md", text + "\n")
     return bands
 
 
-def _shown(name: str, rows: pd.DataFrame, bands: Sequence[Band]) -> dict[str, object]:
+def _line(name: str, rows: pd.DataFrame, bands: Sequence[Band]) -> dict[str, object]:
     """A sensor's line of the page."""
     own = [band for band in bands if band.sensor == name]
     facing = rows[rows.tilt_deg == 0]
@@ -167,24 +150,19 @@ def judge(subject: Subject, flat: pd.DataFrame, edge: dict[str, Any]) -> list[Ba
     others are judged by their names.
     """
     name, sensor = subject.name, subject.sensor
-    fitted = isinstance(sensor, FittedDepth)
     facing = flat[flat.tilt_deg == 0]
     gentle = flat[flat.tilt_deg <= 45]
     found: list[_Row] = []
-    if subject.focal_baseline is not None and not fitted:
-        near = facing[facing.depth_m <= (max(_D435_M) if "d435" in name else np.inf)]
-        found.append(("sigma_Z grows as Z^p: p", exponent(near), 1.8, 2.2))
-        found.append(_bias(subject, facing))
-    if not fitted:
-        found += _device(name, flat, facing)
-    law = facing.sigma_m / (facing.law_m * TRIMMED_NORMAL)
-    if law.notna().any():
-        found.append(("sigma_Z over the sensor's own law", _farthest(law, 1.0), 0.9, 1.1))
     if isinstance(sensor, FittedDepth):
         stated = np.interp(gentle.tilt_deg, sensor.tilts_deg, sensor.fill_rates)
         off = _farthest(1 + gentle.fill - stated, 1.0) - 1
         found.append(("fill beside the preset's own up to 45 degrees", off, -0.05, 0.05))
     else:
+        if subject.focal_baseline is not None:
+            near = facing[facing.depth_m <= (max(_D435_M) if "d435" in name else np.inf)]
+            found.append(("sigma_Z grows as Z^p: p", exponent(near), 1.8, 2.2))
+            found.append(_bias(subject, facing))
+        found += _device(name, flat, facing)
         found.append(("fill up to 45 degrees", float(gentle.fill.min()), 0.95, 1.0))
     return [Band(name, *each) for each in found + _edge(edge)]
 
@@ -225,7 +203,8 @@ def _device(name: str, flat: pd.DataFrame, facing: pd.DataFrame) -> Iterator[_Ro
     by_depth = facing.set_index("depth_m")
     if name.startswith("kinect_v1"):
         for z in _NGUYEN_M:
-            ratio = by_depth.sigma_m.get(z, np.nan) / float(nguyen_axial_m(z))
+            # Axial noise up to 60 degrees (Nguyen, Izadi and Lovell, 3DIMPVT 2012).
+            ratio = by_depth.sigma_m.get(z, np.nan) / (0.0012 + 0.0019 * (z - 0.4) ** 2)
             yield f"sigma_Z at {z:g} m over Nguyen's", float(ratio), 0.7, 1.3
     if "d415" in name:
         for key, (low, high) in _REAL_D415.items():
@@ -236,7 +215,9 @@ def _device(name: str, flat: pd.DataFrame, facing: pd.DataFrame) -> Iterator[_Ro
         yield "sub-pixel RMS, px", _farthest(near.subpixel_rms_px, (low + high) / 2), low, high
     if "d435" in name:
         asked = facing[facing.depth_m.isin(_D435_M)]
-        ratio = np.log(asked.sigma_m / kotsonis_d435_m(asked.depth_m))
+        # Axial noise as measured by L. Kotsonis (elevation_mapping, 0.2 to 3.25 m).
+        kotsonis_m = 0.000611 + 0.003587 * (asked.depth_m - 0.3515) ** 2
+        ratio = np.log(asked.sigma_m / kotsonis_m)
         yield "sigma_Z over a real D435's (Kotsonis)", float(np.exp(_farthest(ratio, 0))), 0.7, 1.3
     for tilt, (low, high) in _FILL_TILTED.items():
         if "d4" in name and (flat.tilt_deg == tilt).any():  # a quick bench leaves them out

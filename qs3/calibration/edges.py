@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from qs3.calibration.planes import median
 from qs3.calibration.subject import POSE, Subject, box_of, quad
 from qs3.sensors.renderers.base import Renderer
 
@@ -18,15 +19,8 @@ _HALF_PX = 40  # half the square's side
 _IN_A_ROW = np.ones(5, dtype=int)
 
 
-def measure(
-    subject: Subject,
-    renderer: Renderer,
-    frames: int = 8,
-    depths_m: tuple[float, float] | None = None,
-) -> dict[str, Any]:
+def measure(subject: Subject, renderer: Renderer, frames: int = 8) -> dict[str, Any]:
     """Render and measure `frames` squares, each elsewhere by fractions of a pixel.
-
-    `depths_m` are those of square and wall; None: what the sensor reaches.
 
     Returns:
         sensor, near_m, far_m; widths in px of the shadow of the other camera and of the projector,
@@ -37,7 +31,6 @@ def measure(
     within = subject.depths_m()
     near_m = within[min(1, len(within) - 2)]
     far_m = min((z for z in within if z > near_m), key=lambda z: abs(z - 2 * near_m))
-    near_m, far_m = depths_m or (near_m, far_m)
     fb, k, middle_m = subject.focal_baseline, subject.sensor.intrinsics, (near_m + far_m) / 2
     shadow = (fb or 0.0) * (1 / near_m - 1 / far_m)
     around = int(np.ceil(abs(shadow))) + subject.margin_px + 20  # a projector may be to the left
@@ -74,7 +67,7 @@ def measure(
     if source_m is not None:
         out["projector_expected_px"] = k.focal_px * source_m * (1 / near_m - 1 / far_m)
     edges = np.concatenate(found["edge"])
-    out["reaches_px"], out["wall_px"] = (_median(column) for column in edges.T)
+    out["reaches_px"], out["wall_px"] = (median(column) for column in edges.T)
     out["half_window_px"] = np.nan if subject.window_px is None else subject.window_px / 2
     return out
 
@@ -125,8 +118,3 @@ def _open_edge(clean: np.ndarray, depth: np.ndarray, middle_m: float) -> np.ndar
         beyond = np.convolve(far[row, edge + 1 :], _IN_A_ROW, mode="valid") == len(_IN_A_ROW)
         out.append([last - edge, np.argmax(beyond) if beyond.any() else np.nan])
     return np.array(out, dtype=np.float64)
-
-
-def _median(values: np.ndarray) -> float:
-    good = values[np.isfinite(values)]
-    return float(np.median(good)) if good.size else np.nan

@@ -38,7 +38,7 @@ def statistics(grey: torch.Tensor) -> torch.Tensor:
     mean = blurred(grey, torch.tensor(_SMOOTH_PX, dtype=grey.dtype))
     frame = int(4 * _SMOOTH_PX)  # the shading is not known there
     texture = (grey / mean.clamp_min(1e-9) - 1)[frame:-frame, frame:-frame]
-    wide, high = texture.shape[1], texture.shape[0]
+    high, wide = texture.shape
     covariances = [
         (texture[:, lag:] * texture[:, : wide - lag]).mean()
         + (texture[lag:] * texture[: high - lag]).mean()

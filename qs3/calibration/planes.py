@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from qs3.calibration.subject import ALBEDO, POSE, Subject, box_of, quad
+from qs3.calibration.subject import POSE, Subject, box_of, quad
 from qs3.geometry.cameras import Intrinsics, Window
 from qs3.sensors.base import DepthFrame
-from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.renderers.base import Body, Renderer
 
 _TRIM = 0.005
@@ -30,10 +29,9 @@ class TiltedPlane:
     """A plane through a point of a pixel's ray, turned away from that ray.
 
     Attributes:
-        depth_m: along the optical axis, at the centre of the region.
-        tilt_deg: angle of incidence there; its sign is the side to which the plane recedes.
-        along: the plane recedes along the rows of the image (along the baseline); else along
-            the columns.
+        depth_m, tilt_deg: at the centre of the region, along the optical axis and from the ray;
+            the sign of the tilt is the side to which the plane recedes.
+        along: it recedes along the rows of the image (along the baseline), else along columns.
         centre_px: (u, v) of the region's centre, relative to the principal point.
     """
 
@@ -138,7 +136,6 @@ def measure(
         subpixel_rms_px: of the disparity about the plane fitted to each image.
         bias_px: as bias_m, of the disparity.
         correlation_px: over how many pixels noise is shared, see `correlation_px`.
-        law_m: noise that the sensor states itself.
     """
     found: dict[str, list[Any]] = defaultdict(list)
     fb, facing = subject.focal_baseline, tilt_deg == 0
@@ -150,7 +147,6 @@ def measure(
         frame, part = take(subject, plane, half_px, renderer, np.random.default_rng([0, k]))
         for key, value in _measured(frame, part, fb).items():
             found[key].append(value)
-        found["law_m"].append(stated_sigma_m(subject.sensor, plane.depth_m, frame))
     error, wanted = np.concatenate(found["error_m"]), sum(found["pixels"])
     out: dict[str, Any] = {
         "sensor": subject.name,
@@ -160,14 +156,13 @@ def measure(
         "pixels": wanted,
         "fill": len(error) / wanted,
         "sigma_m": _spread(error),
-        "bias_m": _median(error),
-        "accuracy": _median(error) / depth_m,
-        "law_m": _rms(np.array(found["law_m"])) if facing else np.nan,
+        "bias_m": median(error),
+        "accuracy": median(error) / depth_m,
     }
     if fb is None:
         return out
     out["subpixel_rms_px"] = _rms(np.array(found["rms_px"]))
-    out["bias_px"] = _median(np.concatenate(found["error_px"]))
+    out["bias_px"] = median(np.concatenate(found["error_px"]))
     if facing:
         out["correlation_px"] = correlation_px(found["residual"]) * subject.step_px
     return out
@@ -247,37 +242,16 @@ def fit_plane(depth_m: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return normal / (normal @ centre)
 
 
-def stated_sigma_m(sensor: Any, depth_m: float, frame: DepthFrame) -> float:
-    """Standard deviation of the depth of a plane that faces the sensor, by the sensor's own law.
-
-    `frame` is of that plane, for exposures that are not known beforehand. NaN if there is no law.
-    """
-    if isinstance(sensor, FittedDepth):  # its law is that before the quantiser
-        steps = (sensor.inverse_step_per_m * depth_m**2, sensor.depth_step_m)
-        rounding = np.hypot(*steps) / np.sqrt(12)
-        return float(np.hypot(sensor.noise_law_m(depth_m), rounding))
-    if hasattr(sensor, "distance_sigma_m"):  # time of flight: light falls with the square
-        lamp = sensor.electrons_at_1m * ALBEDO / depth_m**2
-        mean = lamp + sensor.electrons_at_1m * ALBEDO * sensor.ambient
-        return float(sensor.distance_sigma_m(sensor.contrast * lamp, mean))
-    if hasattr(sensor, "depth_sigma_m") and "modulation" in frame.images:  # fringes
-        modulation = float(np.median(frame.images["modulation"]))
-        per_grey = sensor.infrared.electrons_at_white / 255
-        mean_e = float(frame.images["exposures"].mean()) * per_grey
-        shot_and_read = np.sqrt(mean_e + sensor.infrared.read_noise_e**2) / per_grey
-        noise = float(np.hypot(shot_and_read, np.sqrt(1 / 12)))  # and whole grey values
-        return float(sensor.depth_sigma_m(depth_m, noise, modulation))
-    return float(getattr(sensor, "noise_sigma_m", np.nan))
-
-
 def _rms(values: np.ndarray) -> float:
     """Root of the mean square of what is finite; NaN of nothing."""
     good = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(good)))) if good.size else np.nan
 
 
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if values.size else np.nan
+def median(values: np.ndarray) -> float:
+    """Of what is finite; NaN of nothing."""
+    good = values[np.isfinite(values)]
+    return float(np.median(good)) if good.size else np.nan
 
 
 def _spread(values: np.ndarray) -> float:
@@ -294,21 +268,18 @@ def correlation_px(residuals: Sequence[np.ndarray]) -> float:
     `residuals` are [h, w] with NaN and mean 0; rows and columns of all are pooled, and the
     correlation is interpolated between whole pixels. NaN if it does not fall so far.
     """
-    before = 1.0
-    power = np.concatenate([image.ravel() ** 2 for image in residuals])
-    if not np.isfinite(power).any():
-        return np.nan
-    variance = float(np.nanmean(power))
-    longest = min(min(image.shape) for image in residuals) - 1
-    for lag in range(1, longest + 1):
+    before, variance = 1.0, 0.0
+    for lag in range(min(min(image.shape) for image in residuals)):
         pairs = []
         for image in residuals:
-            pairs += [image[:, lag:] * image[:, :-lag], image[lag:] * image[:-lag]]
+            high, wide = image.shape
+            pairs += [image[:, lag:] * image[:, : wide - lag], image[lag:] * image[: high - lag]]
         products = np.concatenate([pair.ravel() for pair in pairs])
         if not np.isfinite(products).any():
             break
-        here = float(np.nanmean(products)) / max(variance, 1e-30)
-        if here <= 0.5:
-            return lag - 1 + (before - 0.5) / (before - here)
-        before = here
+        here = float(np.nanmean(products))
+        variance = variance or max(here, 1e-30)
+        if lag and here <= 0.5 * variance:
+            return lag - 1 + (before - 0.5) / (before - here / variance)
+        before = here / variance
     return np.nan

@@ -20,9 +20,6 @@ from qs3.sensors.base import DepthSensor
 from qs3.sensors.renderers.base import Body
 
 POSE = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
-ALBEDO = 0.8
-"""Albedo of all targets: a light wall."""
-
 _DEPTHS_M = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 
 
@@ -108,7 +105,7 @@ def _to_world(points_m: np.ndarray) -> np.ndarray:
 
 def quad(corners_m: np.ndarray) -> Body:
     """A target with corners [4, 3] in the camera's frame."""
-    return Body(Mesh(_to_world(corners_m), np.array([[0, 1, 2], [0, 2, 3]])), ALBEDO)
+    return Body(Mesh(_to_world(corners_m), np.array([[0, 1, 2], [0, 2, 3]])), albedo=0.8)
 
 
 def box_of(points_m: np.ndarray) -> np.ndarray:

@@ -25,9 +25,9 @@ _LEAST_IN_BIN = 400
 _FACING_DEG = 50.0  # noise is measured at smaller angles of incidence
 _LEAST_RANGE = 1.3  # of distances, to tell one law from another
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
-_MAX_LEVELS, _MAX_TRIALS = 3000, 20_000
+_MAX_TRIALS = 20_000
 _CLEAR = 0.75  # mean resultant length of the levels' phases that is a lattice
-TRIMMED_NORMAL = 0.9616
+_TRIMMED_NORMAL = 0.9616
 """Standard deviation of a normal variable without its outer 2 x 0.5 %, relative to the whole:
 sqrt(1 - 2 a phi(a) / 0.99) with a = 2.5758."""
 
@@ -182,9 +182,6 @@ def _lattice(x: np.ndarray, weight: np.ndarray, blur: np.ndarray) -> float:
     those nearly as large the coarsest step, because every fraction of it fits, too. `blur` [N] is
     the width of the interval in which rounding in the file moves each level.
     """
-    if len(x) > _MAX_LEVELS:
-        keep = np.linspace(0, len(x) - 1, _MAX_LEVELS).astype(int)
-        x, weight, blur = x[keep], weight[keep], blur[keep]
     gaps = np.abs(np.diff(x))
     wide = (gaps > 1.5 * blur[1:]) & (gaps < 8 * np.median(gaps))  # not those between walls
     if wide.sum() < max(8, 0.1 * len(gaps)):
@@ -271,7 +268,7 @@ def _inner_variance(values: np.ndarray) -> float:
     """Variance of a normal law, from the inner 99 % of [N] values."""
     near, far = np.quantile(values, [0.005, 0.995])
     inner = values[(values >= near) & (values <= far)]
-    return float(inner.var()) / TRIMMED_NORMAL**2
+    return float(inner.var()) / _TRIMMED_NORMAL**2
 
 
 def _correlation_px(walls: Sequence[Wall], steps: Steps) -> float:

@@ -75,7 +75,7 @@ class FittedDepth(DepthSensor):
             cy_px=middle.cy_px if self.cy_px is None else self.cy_px,
         )
 
-    def noise_law_m(self, depth_m: float) -> float:
+    def noise_law_m(self, depth_m: np.ndarray | float) -> np.ndarray | float:
         """Standard deviation of the noise at a distance, before the quantiser."""
         return self.noise_floor_m + self.noise_factor * depth_m**self.noise_power
 
@@ -89,8 +89,8 @@ class FittedDepth(DepthSensor):
         noise = _smooth(clean_m.shape, self.correlation_px / self.step_px, rng)
         hit = np.isfinite(clean_m)
         true = np.where(hit, clean_m, 1.0).astype(np.float64)
-        sigma = self.noise_floor_m + self.noise_factor * true**self.noise_power
-        found = true + np.polynomial.polynomial.polyval(true, self.bias_m) + sigma * noise
+        bias = np.polynomial.polynomial.polyval(true, self.bias_m)
+        found = true + bias + self.noise_law_m(true) * noise
         found = np.maximum(found, 1e-3)
         if self.inverse_step_per_m:
             steps = np.maximum(np.rint(1 / (found * self.inverse_step_per_m)), 1)

@@ -26,7 +26,6 @@ samples lie in their pixels. The scene must stand still meanwhile, as it does he
 
 from __future__ import annotations
 
-import math
 from dataclasses import field
 from functools import cached_property
 from typing import Annotated
@@ -136,17 +135,6 @@ class FringeProjection(TriangulatingSensor):
     def margin_px(self) -> int:
         """A pixel."""
         return 1
-
-    def depth_sigma_m(
-        self, depth_m: float, noise: float | np.ndarray, modulation: float | np.ndarray
-    ) -> float | np.ndarray:
-        """sigma_Z at depth Z, by the module's law.
-
-        `noise` is sigma_n, rounding included, and `modulation` M, both in grey values.
-        """
-        phase = math.sqrt(2 / self.code.steps) * noise / modulation
-        place = phase / (2 * np.pi * self.code.periods[-1])
-        return depth_m**2 / self.baseline_m * 2 * self.tan_half_width * place
 
     def take(self, shot: Shot) -> DepthFrame:
         """See `DepthSensor.take`.

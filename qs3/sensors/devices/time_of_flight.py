@@ -96,14 +96,6 @@ class TimeOfFlight(DepthSensor):
         """A pixel."""
         return 1
 
-    def distance_sigma_m(
-        self, amplitude_e: float | np.ndarray, mean_e: float | np.ndarray
-    ) -> float | np.ndarray:
-        """The law above, along the ray, from A and K (R + B) in electrons a bucket."""
-        together = sum(f**2 for f in self.frequencies_hz) ** 0.5
-        noise = np.sqrt(mean_e + self.read_noise_e**2) / (math.sqrt(2) * amplitude_e)
-        return SPEED_OF_LIGHT / (4 * math.pi * together) * noise
-
     def take(self, shot: Shot) -> DepthFrame:
         """See `DepthSensor.take`. The lamp's light is rendered anyway, so shadow is explained."""
         window = shot.window

@@ -24,7 +24,9 @@ def law_of(camera, frame, depth):
     per_grey = camera.infrared.electrons_at_white / 255
     electrons = finest.mean(axis=0) * per_grey + camera.infrared.read_noise_e**2
     noise = np.sqrt(electrons / per_grey**2 + 1 / 12)  # shot, read-out, rounding
-    return camera.depth_sigma_m(depth, noise, middle(frame.images["modulation"]))
+    phase = np.sqrt(2 / camera.code.steps) * noise / middle(frame.images["modulation"])
+    place = phase / (2 * np.pi * camera.code.periods[-1])
+    return depth**2 / camera.baseline_m * 2 * camera.tan_half_width * place
 
 
 @pytest.mark.parametrize("white_level", [pytest.param(70.0, marks=pytest.mark.slow), 220.0])

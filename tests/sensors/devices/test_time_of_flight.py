@@ -41,7 +41,10 @@ def test_noise_and_bias_follow_the_stated_law(renderer, albedo, frequencies):
         assert np.isfinite(error).all()
         light = albedo / depth**2  # white at 1 m has radiance 1
         mean_e = camera.electrons_at_1m * (light + albedo * camera.ambient)
-        sigma = camera.distance_sigma_m(camera.electrons_at_1m * camera.contrast * light, mean_e)
+        amplitude_e = camera.electrons_at_1m * camera.contrast * light
+        noise = np.sqrt(mean_e + camera.read_noise_e**2) / (math.sqrt(2) * amplitude_e)
+        together = math.hypot(*frequencies)
+        sigma = SPEED_OF_LIGHT / (4 * math.pi * together) * noise
         assert error.std() == pytest.approx(sigma, rel=0.05)  # of about 8,000 pixels
         assert abs(error.mean()) < 4 * sigma / np.sqrt(error.size) + 1e-6
         seen.append(error.std())

@@ -14,10 +14,10 @@ MATCHERS = {
     "census": CensusMatcher(64),
 }
 # Error of the median in one sub-pixel phase, rms of a pixel, mean of the medians over all phases.
-# Census has a test of its own.
 BARS = {
     "block": (0.05, 0.06, 0.01),
     "correlation": (0.04, 0.06, 0.005),
+    "census": (0.02, 0.06, 0.005),
 }
 
 

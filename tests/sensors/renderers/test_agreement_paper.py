@@ -48,17 +48,15 @@ def mesh_of(name):
     return items[{"lamp": 1, "plant": 2}.get(name, 3)].load()
 
 
-def compare(name, samples, window_px=None, gloss=None, light=None):
-    """Check Blender against Mitsuba on one object; `window_px` limits the render to its middle."""
+def compare(name, samples, gloss=None, light=None):
+    """Check Blender against Mitsuba on the middle of one object."""
     rng = np.random.default_rng(0)
     mesh = UnitCube().place(mesh_of(name), rng, name)
     (pose,) = AnchoredViews(count=1).poses(rng, mesh.bounds, name)
     k = Intrinsics.centred(SENSOR.width_px, SENSOR.height_px, SENSOR.focal_px)
     left = Camera(k, pose)
     right = left.moved((SENSOR.baseline_m, 0, 0))
-    windows = [window_of(mesh.bounds, camera, margin_px=10) for camera in (left, right)]
-    if window_px is not None:
-        windows = middle_of(windows[0], window_px)
+    windows = middle_of(window_of(mesh.bounds, left, margin_px=10), 180)
     middle = left.moved((SENSOR.baseline_m / 2, 0, 0)).world_from_camera
     scene = Scene(
         (Body(mesh, gloss=gloss),),
@@ -114,7 +112,7 @@ def middle_of(window, side_px):
     ],
 )
 def test_disparities_agree_in_a_window(name):
-    compare(name, samples=8, window_px=180)
+    compare(name, samples=8)
 
 
 @pytest.mark.slow
@@ -123,10 +121,4 @@ def test_disparities_agree_in_a_window(name):
 def test_disparities_agree_on_shiny_bodies_in_the_paper_s_light(name, gloss):
     """The light of conf/light/area.yaml."""
     light = build(OmegaConf.load(CONF / "light" / "area.yaml").light)
-    compare(name, samples=16, window_px=180, gloss=gloss, light=light)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*FURNITURE, *SOLIDS])
-def test_disparities_agree_on_the_whole_object(name):
-    compare(name, samples=16)
+    compare(name, samples=16, gloss=gloss, light=light)
