@@ -1,13 +1,9 @@
 """What a step would ask of an accelerator, counted where there is none.
 
 Tensors of torch's `meta` device have shapes but no values, so whatever asks for a value fails:
-`.item()`, `.tolist()`, `.cpu()`, `if tensor:`, indexing by a mask, `nonzero`, `bincount`. On a GPU
-all of these wait for it. (So does assignment by a mask, which passes here.) And everything takes
-the paths that a GPU takes: on the CPU sampling and neighbours go through numpy, and nets through
-kernels made for its caches.
-
-Operations are those that reach a device's dispatcher: a call is a kernel or a few. `Watch.kernels`
-leaves out views and allocations, which start none.
+`.item()`, `.cpu()`, `if tensor:`, indexing by a mask, `nonzero`. On a GPU all of these wait for it.
+And everything takes the paths that a GPU takes. Operations are those that reach a device's
+dispatcher: a call is a kernel or a few.
 """
 
 from __future__ import annotations

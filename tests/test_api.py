@@ -1,6 +1,5 @@
 """The commands as functions, on the toy problem that the notebooks use."""
 
-import numpy as np
 import pytest
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -23,9 +22,6 @@ def test_toy_is_the_same_each_time_and_as_it_says(tmp_path):
     assert source.sha256 != write_toy(tmp_path / "c", seed=1)[0].sha256
     assert set(source.counts()["train"].values()) == {30}
     assert list(target.counts()["train"].values()) == [120, 30, 60, 30]
-    for cls, half_axes in SHAPES.items():  # the source hardly leaves its ellipsoid
-        of_class = source.points[source.labels == source.classes.index(cls)]
-        assert np.abs(np.linalg.norm(of_class / half_axes, axis=2) - 1).mean() < 0.12
     weights = sum(p.numel() for p in ToyNet(4).parameters())
     assert 6000 < weights < 8000
     assert ToyNet(4)(torch.rand(5, 64, 3)).shape == (5, 4)

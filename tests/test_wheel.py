@@ -87,4 +87,4 @@ def test_everything_works_in_an_empty_folder(installed, tmp_path):
     assert len((tmp_path / "predictions.csv").read_text().splitlines()) == 31
     said = qs3("qs3", "predict", "input=data/modelnet10/points.npy", "threads=1")  # its own nets
     assert "classifier: dgcnn-speckle, which comes with qs3" in said
-    assert "what it is worth: right about " in said
+    assert "accuracy on real objects: right about " in said

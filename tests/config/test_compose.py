@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -19,28 +16,6 @@ from omegaconf import OmegaConf
 from qs3.config.compose import composed, override, quoted
 from qs3.errors import ConfigError
 from qs3.tools.toy import toy_overrides
-
-APP = """
-import os
-import hydra
-
-@hydra.main(version_base="1.1", config_path=None)
-def main(cfg):
-    print(os.getcwd(), hydra.core.hydra_config.HydraConfig.get().job.name, flush=True)
-    from qs3.datasets.domain import compose_domain
-    compose_domain("own", {})
-
-main()
-"""
-
-
-def test_an_application_of_another_version_goes_on_as_it_began(tmp_path):
-    """By Hydra 1.1 each job has a working folder of its own; so has the second one."""
-    (tmp_path / "outer.py").write_text(APP)
-    command = [sys.executable, "-W", "ignore", "outer.py", "-m", "+job=0,1", "hydra.sweep.dir=out"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    lines = [line.split() for line in done.stdout.splitlines() if str(tmp_path) in line]
-    assert [(Path(folder).name, name) for folder, name in lines] == [("0", "outer"), ("1", "outer")]
 
 
 @pytest.mark.parametrize("word", ["seed=1", "no_such=1"])

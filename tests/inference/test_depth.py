@@ -167,16 +167,6 @@ def test_two_folders_go_together_by_name_and_damage_costs_one(run, frame):
     assert not (frame / "said.html").exists()
 
 
-def test_intrinsics_of_another_resolution_are_cautioned(run, frame, words):
-    half = tuple(value / 2 for value in SHOT.camera)
-    words[2] = f"intrinsics={','.join(map(str, half))}"
-    assert predict(run, frame / "said.csv", *words, "page=false") == 0
-    assert all("25% of a side" in row["caution"] for row in table(frame / "said.csv"))
-    depth, mask = seen()
-    found = qs3.load(run).predict_depth(depth / 1000, half, mask=mask, up=(0, -1, 0))
-    assert all("another resolution" in one.cautions[-1].words for one in found)
-
-
 def test_nothing_measured_is_a_failed_row(run, frame, words):
     depth, mask = seen()
     save(frame / "depth.png", np.where(mask == 2, 0, depth).astype(np.uint16))

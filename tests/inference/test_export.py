@@ -15,16 +15,14 @@ from torch import nn
 
 import qs3
 from qs3.errors import Qs3Error
-from qs3.geometry.ball_query import ball_query
-from qs3.geometry.neighbours import farthest_point_sampling, gather, knn
 from qs3.inference.export import Comparison, any_points, export, made_up, metadata
 from qs3.inference.model_file import Result
 from qs3.inference.predictor import Predictor
-from qs3.models.base import Backbone, Features, PointClassifier
-from qs3.models.dgcnn import EdgeConv, dgcnn
+from qs3.models.base import PointClassifier
+from qs3.models.dgcnn import dgcnn
 from qs3.models.pointdan import pointdan
 from qs3.models.pointnet import pointnet
-from qs3.models.pointnet2 import GroupedMLP, pointnet2
+from qs3.models.pointnet2 import pointnet2
 from qs3.models.rscnn import rscnn
 from qs3.models.simpleview import simpleview
 from tests.inference.conftest import over_the_floor
@@ -234,28 +232,3 @@ def test_single_clouds_may_differ_but_not_many():
     theirs[:5] = 0.02
     assert not Comparison.of(theirs, ours).agrees
     assert not Comparison.of(np.full((1, 3), np.nan), ours[:1]).agrees
-
-
-class Own(Backbone):
-    """A user's net of layers and neighbours of this package, written once."""
-
-    feature_dim, least_points = 12, 6
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.edges, self.groups = EdgeConv(3, 8), GroupedMLP(8, (8, 12))
-
-    def forward(self, points: torch.Tensor) -> Features:
-        x = self.edges(points, knn(points, 6))
-        centres = gather(points, farthest_point_sampling(points, 5))
-        x = self.groups(points, x, centres, ball_query(points, centres, 0.5, 8))
-        return Features(x.amax(1), None)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", ["onnx", "pt2"])
-def test_a_net_of_one_s_own_is_exported_as_it_is(tmp_path, suffix):
-    torch.manual_seed(0)
-    predictor = predictor_of(PointClassifier(Own(), nn.Linear(12, 3)))
-    assert any_points(predictor)
-    assert export(predictor, tmp_path / f"net.{suffix}", made_up(64, 6)[1::2]).typical <= 1e-4

@@ -1,16 +1,11 @@
-"""A classifier on disk gives itself back to the last bit, and nothing that was damaged or made up.
-
-Folders also through huggingface_hub's own mixin, without a network.
-"""
+"""A classifier on disk gives itself back to the last bit, and nothing damaged or made up."""
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import re
 import shutil
-import socket
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +14,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from huggingface_hub import PyTorchModelHubMixin
-from hydra.utils import instantiate
-from torch import nn
 
 import qs3
 from qs3.classes import CLASSES
@@ -32,7 +24,6 @@ from qs3.inference.model_file import (
     CONFIG,
     PRETRAINED,
     WEIGHTS,
-    build_net,
     find_result,
     pretrained_names,
     read_result,
@@ -271,42 +262,3 @@ def test_a_folder_of_the_name_comes_first(exported, tmp_path, monkeypatch):
     assert find_result(name) == PRETRAINED / name / WEIGHTS
     shutil.copytree(exported, tmp_path / name)
     assert qs3.load(name).classes == ("ball", "rod", "slab")
-
-
-class HubClassifier(nn.Module, PyTorchModelHubMixin, library_name="qs3"):
-    """What a user writes to have `from_pretrained` and `push_to_hub` from config.json's values."""
-
-    def __init__(self, model: dict[str, Any], classes: list[str], **more: Any) -> None:
-        super().__init__()
-        self.classes, self.more = classes, more
-        self._net = [instantiate(model)]  # in a list, so that its weights keep their names
-        for name, child in self._net[0].named_children():
-            self.add_module(name, child)
-
-    def forward(self, points: torch.Tensor) -> torch.Tensor:
-        return self._net[0](points)
-
-
-def test_the_mixin_loads_what_comes_with_qs3_and_saves_it(tmp_path, monkeypatch):
-    def refused(*_, **__):
-        raise AssertionError("the network was asked")
-
-    monkeypatch.setattr(socket, "create_connection", refused)
-    monkeypatch.setattr(socket.socket, "connect", refused)
-    points = torch.randn(3, 512, 3, generator=torch.Generator().manual_seed(0)) / 2
-    for name in pretrained_names():
-        folder = PRETRAINED / name
-        hub = HubClassifier.from_pretrained(str(folder), strict=True).eval()
-        assert tuple(hub.classes) == CLASSES
-        ours = build_net(read_result(folder))
-        for key, value in ours.state_dict().items():
-            assert torch.equal(hub.state_dict()[key], value), key
-        with torch.inference_mode():
-            torch.testing.assert_close(hub(points), ours(points))
-    hub.save_pretrained(tmp_path)
-    saved, kept = (json.loads((path / CONFIG).read_text()) for path in (tmp_path, folder))
-    for key in ("model", "classes", "points", "scale", "gravity", "usual"):
-        assert saved[key] == kept[key]
-    # The mixin writes 32 bits; the hash in config.json is that of the 16 bits it read.
-    shutil.copy(folder / WEIGHTS, tmp_path / WEIGHTS)
-    assert qs3.load(tmp_path).classes == CLASSES
