@@ -15,11 +15,10 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Float
 
-from qs3.generation.scenes import HAIR_M, prism, rectangle, table
+from qs3.generation.scenes import HAIR_M, prism, rectangle, ring_of, table
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.mesh import Mesh, merge
-from qs3.meshes.placement import Positive, Share
-from qs3.utils.settings import settings
+from qs3.utils.settings import NotNegative, Positive, Share, settings
 
 _CHAIR_M = (0.38, 0.55)
 _SEAT_M = (0.42, 0.5)
@@ -62,7 +61,7 @@ class Arrangement:
     max_side_m: Positive = 1.6
     board_m: Positive = 0.06
     leg_m: Positive = 0.05
-    apart_m: Annotated[float, Ge(0)] = 0.3
+    apart_m: NotNegative = 0.3
     things: Mapping[str, Annotated[int, Ge(0)]] = field(default_factory=dict)
     min_thing_m: Positive = 0.06
     max_thing_m: Positive = 0.4
@@ -158,7 +157,7 @@ class Arrangement:
             if not len(free):
                 continue
             cell = free[int(spot[0] * len(free))]
-            ring = _ring(size[:2], sides, yaw) + low + (cell + 0.5) * _CELL_M
+            ring = ring_of(size[:2], sides, yaw) + low + (cell + 0.5) * _CELL_M
             bottom = float(heights[tuple(cell)]) + HAIR_M
             found.append(prism(ring, bottom, bottom + float(size[2])))
         return found
@@ -189,14 +188,3 @@ def flat_within(heights: Float[np.ndarray, "x y"], radius_m: float) -> np.ndarra
     highest = maximum_filter(heights, 2 * reach + 1, mode="constant", cval=-np.inf)
     with np.errstate(invalid="ignore"):
         return np.isfinite(lowest) & (highest - lowest < _FLAT_M)
-
-
-def _ring(size: np.ndarray, sides: int, yaw: float) -> np.ndarray:
-    """[n, 2] a rectangle's or an ellipse's outline around 0, counter-clockwise."""
-    if sides == 4:
-        ring = rectangle(-size / 2, size / 2)
-    else:
-        turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-        ring = np.column_stack([np.cos(turn), np.sin(turn)]) * size / 2
-    c, s = np.cos(yaw), np.sin(yaw)
-    return ring @ np.array([[c, s], [-s, c]])

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from annotated_types import Ge, Gt
 
 from qs3.geometry.cameras import look_at, rotation_xyz
-from qs3.utils.settings import settings
-
-Positive = Annotated[float, Gt(0)]
-NotNegative = Annotated[float, Ge(0)]
-Count = Annotated[int, Ge(1)]
+from qs3.utils.settings import Count, NotNegative, Positive, settings
 
 
 @runtime_checkable
@@ -55,11 +50,7 @@ class AnchoredViews:
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
     ) -> list[np.ndarray]:
         """`count` poses [4, 4] world_from_camera around a box [2, 3]; the first is the anchor."""
-        target_m = box_m.mean(axis=0)
-        distance = rng.uniform(self.min_distance_m, self.max_distance_m)
-        elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
-        azimuth = rng.uniform(0, 2 * np.pi)
-        anchor = look_at(target_m + distance * direction(azimuth, elevation), target_m)
+        anchor = self.anchor(rng, box_m)
         poses = [anchor]
         for _ in range(self.count - 1):
             pose = anchor.copy()
@@ -68,6 +59,18 @@ class AnchoredViews:
             pose[:3, :3] = anchor[:3, :3] @ rotation_xyz(turn)
             poses.append(pose)
         return poses
+
+    def anchor(self, rng: np.random.Generator, box_m: np.ndarray) -> np.ndarray:
+        """[4, 4] a pose that looks at the middle of the box."""
+        target_m = box_m.mean(axis=0)
+        distance = rng.uniform(self.min_distance_m, self.max_distance_m)
+        elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
+        away = direction(self.azimuth_rad(rng), elevation)
+        return look_at(target_m + distance * away, target_m)
+
+    def azimuth_rad(self, rng: np.random.Generator) -> float:
+        """From the x axis towards y."""
+        return rng.uniform(0, 2 * np.pi)
 
 
 @settings

@@ -1,4 +1,4 @@
-"""What scans leave besides their clouds: each point's provenance, views, and contact sheets.
+"""What scans leave besides their clouds: each point's provenance, views, and a contact sheet.
 
     views/chair/train/chair_0007/view_0.npz    see `save_view`
     views/chair/train/chair_0007/view_0.png    infrared, disparity, depth, and why there is none
@@ -10,18 +10,15 @@ same bytes.
 
 from __future__ import annotations
 
-import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qs3.errors import DataError, Qs3Error
-from qs3.geometry.cameras import Camera, Intrinsics
+from qs3.errors import Qs3Error
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.optics.visibility import Reason
 from qs3.utils.files import remove_leftovers, write_bytes
@@ -38,7 +35,6 @@ NO_INCIDENCE_DEG = -1.0
 
 _NOT_A_PHOTOGRAPH = ("right", "reference", "disparity", "clean", "lit", "seen")
 _MAPS = ("depth_m", "clean_m", "label", "cosine", "reason")  # of a DepthFrame
-_LONGEST_NAME = 200  # bytes; file systems allow 255, and the temporary name is longer
 _PANEL_IN = 2.5  # of a picture
 REASON_COLOURS = {  # BGR
     Reason.OK: (120, 160, 60),
@@ -56,9 +52,6 @@ REASON_COLOURS = {  # BGR
 }
 OBJECTS = 4  # a class, in clouds.png
 _KINDS = {"points": "measured", "points_clean": "clean twin"}
-_IMAGES = {"infrared": ("infrared", "gray", ""), "disparity": ("disparity", "viridis", "px"),
-           "depth_m": ("depth", "viridis", "m")}  # fmt: skip
-
 Arrays = Mapping[str, np.ndarray]
 
 
@@ -68,14 +61,12 @@ class Keep:
 
     Attributes:
         provenance: add the array "provenance" to the cloud.
-        views: folder for the images and depths of every view; None keeps none. The views are
-            then scanned with `explain`, which costs renders.
-        previews: ids of the objects whose first view is kept in small, for the contact sheet.
+        view: takes each view as `save_view` does, from its object's id on; None: nobody does. With
+            it views are scanned with `explain`, which costs renders.
     """
 
     provenance: bool = False
-    views: Path | None = None
-    previews: frozenset[str] = frozenset()
+    view: Callable[[str, int, DepthFrame, np.ndarray, np.ndarray], None] | None = None
 
 
 def provenance_of(frame: DepthFrame, depth_m: np.ndarray, view: int) -> np.ndarray:
@@ -118,26 +109,8 @@ def photograph(images: dict[str, np.ndarray]) -> np.ndarray | None:
     return None
 
 
-def preview_of(frame: DepthFrame) -> dict[str, np.ndarray]:
-    """The pictures of a view that the contact sheet shows, by name: [h, w] each."""
-    disparity = frame.images.get("disparity")
-    if disparity is not None:  # as coarse as the depth: a preview is small
-        disparity = disparity[:: frame.step_px, :: frame.step_px]
-    found = {
-        "infrared": photograph(frame.images),
-        "disparity": disparity,
-        "depth_m": frame.depth_m,
-    }
-    return {name: np.array(image) for name, image in found.items() if image is not None}
-
-
 class DiskError(Qs3Error):
     """A file of the dataset cannot be written; not the fault of the object."""
-
-
-def view_folder(root: Path, object_id: str) -> Path:
-    """Where an object's views lie below `root`; different ids never share a folder."""
-    return root.joinpath(*(_safe(part) for part in object_id.split("/")))
 
 
 def save_view(
@@ -159,7 +132,7 @@ def save_view(
         world_from_camera, world_from_camera_believed: [4, 4] the true pose, and the one that
             tracking believes.
     """
-    folder = view_folder(root, object_id)
+    folder = root / object_id
     remove_leftovers(folder)
     k = frame.camera.intrinsics
     arrays: dict[str, np.ndarray] = {
@@ -181,48 +154,6 @@ def save_view(
         write_bytes(folder / f"view_{view}.npz", compressed.getvalue())
     except (OSError, Qs3Error) as error:
         raise DiskError(str(error)) from error
-
-
-@dataclass(frozen=True, eq=False)
-class KeptView:
-    """A view as `save_view` was given it.
-
-    Attributes:
-        number: among the object's views, from 0.
-        frame: what was measured.
-        world_from_camera: [4, 4] the true pose.
-        believed: [4, 4] the pose that tracking believes.
-    """
-
-    number: int
-    frame: DepthFrame
-    world_from_camera: np.ndarray
-    believed: np.ndarray
-
-
-def load_views(root: Path, object_id: str) -> tuple[KeptView, ...]:
-    """The views of an object that `save_view` wrote, by number; none if there are none."""
-    found = []
-    for path in view_folder(root, object_id).glob("view_*.npz"):
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
-            found.append(_kept(int(path.stem.removeprefix("view_")), arrays))
-        except Exception as error:  # arrays of any kind may be where others were
-            raise DataError(f"{path} is damaged: {error}") from error
-    return tuple(sorted(found, key=lambda view: view.number))
-
-
-def _kept(number: int, arrays: dict[str, Any]) -> KeptView:
-    width, height = (int(value) for value in arrays["size_px"])
-    cx, cy = (float(value) for value in arrays["centre_px"])
-    left, top, step = (int(value) for value in arrays["grid_px"])
-    intrinsics = Intrinsics(width, height, float(arrays["focal_px"]), cx, cy)
-    images = {name[6:]: image for name, image in arrays.items() if name.startswith("image_")}
-    pose, believed = arrays["world_from_camera"], arrays["world_from_camera_believed"]
-    maps = {name: arrays[name] for name in _MAPS}
-    frame = DepthFrame(Camera(intrinsics, pose), left, top, step, images=images, **maps)
-    return KeptView(number, frame, pose, believed)
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:
@@ -259,17 +190,6 @@ def view_picture(frame: DepthFrame) -> Figure:
     return sheet(images, titles, columns=len(titles), panel_in=_PANEL_IN)
 
 
-def _safe(part: str) -> str:
-    """A name for a folder: letters, digits and -._~ stay, the rest becomes %XX."""
-    name = quote(part, safe="")
-    if name in ("", ".", ".."):
-        return f"%{part.encode().hex()}"
-    if len(name) > _LONGEST_NAME:
-        digest = hashlib.sha256(part.encode()).hexdigest()[:16]
-        return f"{name[:_LONGEST_NAME]}%{digest}"
-    return name
-
-
 def clouds_picture(path: Path, clouds: Mapping[str, Sequence[Arrays]], heading: str) -> None:
     """Save a row of clouds a class, each as measured and next to it from the true depth.
 
@@ -292,22 +212,3 @@ def clouds_picture(path: Path, clouds: Mapping[str, Sequence[Arrays]], heading: 
         panel_in=1.25,
     )
     save_png(figure, path, colours=256)
-
-
-def infrared_picture(path: Path, previews: Mapping[str, tuple[str, Arrays]], heading: str) -> None:
-    """Save one view a class: what the camera saw, the disparity, the depth.
-
-    Args:
-        path: of the PNG.
-        previews: by class, an object's id and its pictures (qs3.generation.kept.preview_of).
-        heading: a line above all.
-    """
-    images, titles = [], []
-    for cls, (_, pictures) in previews.items():
-        for kind, (name, colours, unit) in _IMAGES.items():
-            values = np.asarray(pictures.get(kind, np.full((3, 4), np.nan)), dtype=np.float64)
-            low, high = _range(values)
-            images.append(value_image(values, low if unit else 0.0, high, colours))
-            words = f" {low:.2f} to {high:.2f} {unit}" if unit and high > low else ""
-            titles.append(f"{cls}: {name}{words}")
-    save_png(sheet(images, titles, columns=6, heading=heading, panel_in=1.7), path, colours=256)

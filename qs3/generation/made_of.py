@@ -23,13 +23,7 @@ _LIGHTS = {"area": "light above"}
 
 
 def made_of(plan: Plan, outcomes: Sequence[Outcome], recipe: Mapping[str, Any]) -> MadeOf:
-    """The line for figures; of a folder of meshes its last name, and not where it lies.
-
-    Args:
-        plan: what was made.
-        outcomes: of its objects.
-        recipe: of `Plan.describe`.
-    """
+    """What was made, for figures; of a folder of meshes its last name, and not where it lies."""
     objects = "embedded catalogue"
     if plan.options.meshes is not None:
         root = plan.mesh_root.resolve()
@@ -89,11 +83,11 @@ def _own_preset() -> str:
         return ""
     words = [word.lstrip("+~") for word in hydra.overrides.task]
     changed = [word.removeprefix("sensor.") for word in words if word.startswith("sensor.")]
-    return _with(name, changed)
+    return " ".join([name, *["with"] * bool(changed), *changed])
 
 
 def _named(group: str, settings: DictConfig, words: Mapping[str, str] | None = None) -> str:
-    """The file of a folder of conf that settings are most like, and what they have else.
+    """The file of conf/`group` that settings are most like, and what they have else.
 
     `words` has what each file is called; None: its name.
     """
@@ -106,13 +100,7 @@ def _named(group: str, settings: DictConfig, words: Mapping[str, str] | None = N
     if not found:  # of one's own
         return str(plain["_target_"].rsplit(".", 1)[-1])
     _, name, changed = min(found)
-    said = (words or {}).get(name, name)
-    return _with(said, changed)
-
-
-def _with(name: str, changed: Sequence[str]) -> str:
-    """A name and its changed settings."""
-    return f"{name} with {' '.join(changed)}" if changed else name
+    return " ".join([(words or {}).get(name, name), *["with"] * bool(changed), *changed])
 
 
 def _differences(

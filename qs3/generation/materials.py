@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Interval
+from annotated_types import Interval
 from jaxtyping import Int
 
 from qs3.meshes.mesh import Mesh
-from qs3.meshes.placement import Positive, Share
 from qs3.sensors.base import Lighting
 from qs3.sensors.renderers.base import AreaLight, Body
 from qs3.sensors.renderers.gloss import Gloss
-from qs3.utils.settings import settings
+from qs3.utils.settings import Count, NotNegative, Positive, Share, settings
 
 Surface = tuple[float, Gloss]
 """Albedo and gloss."""
@@ -23,7 +22,6 @@ Surface = tuple[float, Gloss]
 _SAME = 1e-5  # of the largest side: vertices nearer to each other are one
 _ALIKE = 1e-3  # of the largest side: parts whose sides differ by less are alike
 
-NotNegative = Annotated[float, Ge(0)]
 Rough = Annotated[float, Interval(ge=0.1, le=1)]
 
 
@@ -64,7 +62,7 @@ class MixedMaterials:
     """
 
     kinds: Mapping[str, Kind]
-    max_materials: Annotated[int, Ge(1)] = 3
+    max_materials: Count = 3
 
     def dress(self, bodies: Sequence[Body], rng: np.random.Generator) -> tuple[Body, ...]:
         """The same shapes with materials; the first body, the object, as one body a material."""

@@ -16,6 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,7 +31,7 @@ from qs3.config.hydra import build
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError
 from qs3.generation.camera_poses import Drift
-from qs3.generation.kept import Keep
+from qs3.generation.kept import Keep, save_view
 from qs3.generation.released import read_poses
 from qs3.generation.room_scans import RoomScan
 from qs3.meshes.folder import SPLITS, MeshFolder
@@ -39,7 +40,7 @@ from qs3.meshes.mesh import MeshItem
 from qs3.meshes.scenes import buffer_files
 from qs3.store.parts import VIEWS as VIEWS_FOLDER
 from qs3.utils.files import sha256_file
-from qs3.utils.settings import problems, settings
+from qs3.utils.settings import Count, problems, settings
 from qs3.utils.version import VERSION
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +55,6 @@ MAKES_CLOUDS = (
 _ADDED = "catalogue-"  # before the names of objects that fill up the user's
 _OTHER_HALF = 1000
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
-_PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
 # Keys of a config that name places, or that never change a byte.
 _UNSTORED = ("paths", "workers", "engine", "force", "strict")
 _OF_LOOKING = ("sensor", "views", "provenance", "keep_views", "poses")
@@ -74,9 +74,9 @@ class Options:
     colliders: Literal["skip", "keep"]
     classes: Annotated[tuple[str, ...], MinLen(1)] | None
     splits: Annotated[tuple[Literal["train", "test"], ...], MinLen(1)] | None
-    limit: Annotated[int, Ge(1)] | None
+    limit: Count | None
     fraction: Annotated[float, Gt(0), Le(1)]
-    scans: Annotated[int, Ge(1)]
+    scans: Count
     provenance: bool
     keep_views: bool
     workers: Annotated[int, Ge(0)]
@@ -194,15 +194,9 @@ class Plan:
         return sorted([*own, *added], key=lambda item: (order[item.cls], SPLITS.index(item.split)))
 
     def keep(self, folder: Path) -> Keep:
-        """What is wanted besides the clouds: provenance, views, and previews of some objects."""
-        seen: Counter[str] = Counter()
-        previews = []
-        for item in self.items:
-            if seen[item.cls] < _PREVIEWS:
-                previews.append(item.id)
-            seen[item.cls] += 1
-        views = folder / VIEWS_FOLDER if self.options.keep_views else None
-        return Keep(self.options.provenance, views, frozenset(previews))
+        """What is wanted besides the clouds: provenance, and views."""
+        save = partial(save_view, folder / VIEWS_FOLDER) if self.options.keep_views else None
+        return Keep(self.options.provenance, save)
 
     def describe(self, renderer: Mapping[str, str]) -> dict[str, Any]:
         """All that decides the bytes of a dataset: what a resume is compared with.
@@ -260,10 +254,8 @@ class Plan:
     def benchmark(self, recipe: Mapping[str, Any]) -> str:
         """Whether this is the benchmark that a domain's version names, a split of it, or like it.
 
-        Returns:
-            "kinectsim10 v2"; "kinectsim10 v2, train" for its train part alone, whose objects are
-            the same; "like kinectsim10 v2, but not it" where settings or objects differ; empty for
-            domains without a version.
+        "kinectsim10 v2"; "kinectsim10 v2, train" for its train part alone; "like kinectsim10 v2,
+        but not it" where settings or objects differ; empty for domains without a version.
         """
         stated = self.cfg.get("benchmark")
         if stated is None:
@@ -279,15 +271,6 @@ class Plan:
             if recipe["objects"] == part and plan_hash(full) == stated.plan_sha256:
                 return f"{name}, {' and '.join(splits)}"
         return f"like {name}, but not it (other settings or objects)"
-
-    def stated_hash(self, recipe: Mapping[str, Any]) -> str:
-        """Content hash that the benchmark should have with this renderer; empty if unknown."""
-        stated = self.cfg.get("benchmark")
-        if stated is None or plan_hash(recipe) != stated.plan_sha256:
-            return ""
-        if "width" in recipe["versions"]:  # of Mitsuba's kernels: not the one that was stated
-            return ""
-        return str(stated.content_sha256.get(recipe["versions"].get("variant"), ""))
 
 
 def planned(cfg: DictConfig) -> Plan:
@@ -319,11 +302,6 @@ def _unused(cfg: DictConfig, recipe: Any) -> list[str]:
     return [key for key, without in no_use.items() if without and cfg.get(key)]
 
 
-def mesh_items(cfg: DictConfig) -> list[MeshItem]:
-    """The objects that a config scans."""
-    return planned(cfg).items
-
-
 def plan_hash(recipe: Mapping[str, Any]) -> str:
     """Hash of settings and objects, without versions, modules and the renderer's variant."""
     plan = {"settings": dict(recipe["settings"]), "objects": recipe["objects"]}
@@ -337,13 +315,9 @@ def plan_hash(recipe: Mapping[str, Any]) -> str:
 def recipe_fingerprint(recipe: Mapping[str, Any], made: Iterable[str]) -> str:
     """Twelve digits of settings, objects, libraries and code, the same on every machine.
 
-    Rays that meet an edge are decided by rounding, and compilers round differently on different
-    processors: of the same meshes, settings and code two machines may make clouds that differ in a
-    few points. Their content hashes differ, this does not, so that results may be averaged.
-
-    Args:
-        recipe: of `Plan.describe`.
-        made: ids of the objects that have a cloud.
+    Compilers round differently on different processors, so that two machines may make clouds that
+    differ in a few points. Their content hashes differ, this does not: results may be averaged.
+    `recipe` is that of `Plan.describe`, `made` are ids of the objects that have a cloud.
     """
     of_the_machine = ("machine", "llvm", "width")
     versions = {k: v for k, v in recipe["versions"].items() if k not in of_the_machine}

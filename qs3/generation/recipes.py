@@ -20,27 +20,22 @@ from pydantic import InstanceOf
 
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
-from qs3.generation.kept import Keep, preview_of, provenance_of, save_view
+from qs3.generation.kept import Keep, provenance_of
 from qs3.generation.materials import LightAbove, MixedMaterials
 from qs3.generation.released import PoseTable, ReleasedPlacing, ReleasedViews, box_of_corners
 from qs3.generation.scenes import Alone, Surroundings
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
 from qs3.meshes.mesh import Mesh
-from qs3.meshes.placement import Placing, Share, UnitCube
+from qs3.meshes.placement import Placing, UnitCube
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.seeding import object_rng
-from qs3.utils.settings import settings
+from qs3.utils.settings import Count, NotNegative, Share, settings
 
 _BARE = Keep()
 _SPARE = 5  # times as many samples as wanted, of which regions may take all but a fifth
 
-Count = Annotated[int, Ge(1)]
 Least = Annotated[int, Ge(0)]
-
-
-class TooFewPointsError(DataError):
-    """The views of an object gave too little to make a cloud of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +48,12 @@ class Cloud:
         views: frames that gave points.
         valid_points: points before sampling.
         frames: the depth frames, for looking at (empty where there are none).
-        preview: small pictures of the first view by name, where they were asked for.
     """
 
     arrays: Mapping[str, np.ndarray]
     views: int
     valid_points: int
     frames: tuple[DepthFrame, ...] = ()
-    preview: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class Recipe(Protocol):
@@ -72,7 +65,7 @@ class Recipe(Protocol):
     def make(
         self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
-        """Make the cloud; TooFewPointsError, MeshError or RenderError give the reason if not.
+        """Make the cloud; DataError or RenderError give the reason if not.
 
         `keep` asks for more than the cloud and never changes it.
         """
@@ -83,13 +76,12 @@ class Recipe(Protocol):
 class BoxCrop:
     """Keep the points in the object's axis-aligned box, enlarged by a margin.
 
-    The released code has no margin: of a face that lies in the box's side only the errors
-    that point inwards survive. Ours keeps both as long as the margin exceeds the noise: of the
-    paper's sensor 3 cm are 4.7 standard deviations at 3 m, 2.6 at 4 m and 1.67 at 5 m
-    (docs/sensors/planes.csv: 6.4, 11.3 and 18.0 mm).
+    The released code has no margin: of a face that lies in the box's side only the errors that
+    point inwards survive. 3 cm are 4.7 standard deviations of the paper's sensor at 3 m, 1.67 at
+    5 m (docs/sensors/planes.csv).
     """
 
-    margin_m: Annotated[float, Ge(0)] = 0.03
+    margin_m: NotNegative = 0.03
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
         """[h, w] bool in the image; None: the box alone decides, after back-projection."""
@@ -105,12 +97,9 @@ class BoxCrop:
 class MaskCrop(BoxCrop):
     """Keep the pixels of the object's mask and box, drawn as sloppily as annotations are.
 
-    The mask of what is really seen grows or shrinks by a few pixels and is shifted, so that
-    a little background comes in and a little of the object's rim goes. Of what came in, the
-    annotated box, taken generously, keeps what is near the object.
-
-    Pixels are those of the depth image: of a sensor that measures every fourth of the camera's
-    (`step_px=4`), one is four of these.
+    The mask of what is really seen grows or shrinks by a few pixels and is shifted; of the
+    background that comes in, the box keeps what is near the object. Pixels are those of the depth
+    image: with `step_px=4` one is four of the camera's.
 
     Attributes:
         min_grow_px, max_grow_px: the mask's outline moves outwards by a whole number of
@@ -119,7 +108,7 @@ class MaskCrop(BoxCrop):
         margin_m: by which the object's axis-aligned box is enlarged.
     """
 
-    margin_m: Annotated[float, Ge(0)] = 0.1
+    margin_m: NotNegative = 0.1
     min_grow_px: int = -1
     max_grow_px: int = 3
     max_shift_px: Least = 2
@@ -142,8 +131,7 @@ class MaskCrop(BoxCrop):
 class DepthErrors:
     """Which errors stay in a frame, to learn what the others are worth.
 
-    They come out of how a sensor forms its images, and are undone by the true depth. So scans with
-    and without them have the same views and noise, and no error is ever drawn from a mask.
+    They are undone by the true depth, so scans with and without them have the same views and noise.
 
     Attributes:
         holes: False: where the object is seen and nothing was measured there is its true depth.
@@ -152,15 +140,14 @@ class DepthErrors:
         reach_px: pixels of the camera to each side that count as close by: half a matcher's block
             and more, as blocks make surfaces wider; 6 for a Kinect's 9, 12 for the paper's 19.
         apart_m, apart_per_m: a depth z belongs to a surface that is nearer to it than apart_m +
-            apart_per_m z^2. By default 2 cm and a fifth of a Kinect's pixel of disparity, three
-            standard deviations of its noise.
+            apart_per_m z^2; by default 2 cm and three standard deviations of a Kinect's noise.
     """
 
     holes: bool = True
     mixed_pixels: bool = True
-    reach_px: Annotated[int, Ge(1)] = 6
-    apart_m: Annotated[float, Ge(0)] = 0.02
-    apart_per_m: Annotated[float, Ge(0)] = 0.005
+    reach_px: Count = 6
+    apart_m: NotNegative = 0.02
+    apart_per_m: NotNegative = 0.005
 
     def left_in(self, frame: DepthFrame) -> DepthFrame:
         """The frame with the errors that stay; its reasons and pictures are what they were."""
@@ -256,15 +243,15 @@ class Mesh2Point:
         noisy, clean, frames, origins = [], [], [], []
         for i, (pose, believed) in enumerate(zip(true_poses, believed_poses, strict=True)):
             view_rng = object_rng(seed, object_id, 2 + i)
-            explain = keep.views is not None
+            explain = keep.view is not None
             frame = self.sensor.scan(bodies, box, pose, renderer, view_rng, explain, lighting)
             if frame is None:
                 continue
             if self.depth_errors is not None:
                 frame = self.depth_errors.left_in(frame)
             frames.append(frame)
-            if keep.views is not None:
-                save_view(keep.views, object_id, i, frame, pose, believed)
+            if keep.view is not None:
+                keep.view(object_id, i, frame, pose, believed)
             mask = self.crop.keep(frame, view_rng)
             depth = frame.depth_m if mask is None else np.where(mask, frame.depth_m, np.nan)
             points = frame.points(depth, believed)
@@ -288,14 +275,13 @@ class Mesh2Point:
             arrays["points_clean"] = true[true_order]
         if keep.provenance:
             arrays["provenance"] = np.concatenate(origins)[order]
-        preview = preview_of(frames[0]) if object_id in keep.previews else {}
-        return Cloud(arrays, len(noisy), sum(map(len, noisy)), tuple(frames), preview)
+        return Cloud(arrays, len(noisy), sum(map(len, noisy)), tuple(frames))
 
     def _sample(self, parts: list[np.ndarray], least: str) -> tuple[np.ndarray, np.ndarray]:
         """All points [M, 3] float32, and which of them make the cloud: [P] indices."""
         total, wanted = sum(map(len, parts)), getattr(self, least)
         if total < max(wanted, 1):
-            raise TooFewPointsError(
+            raise DataError(
                 f"{total} points over {self.views.count} views, fewer than recipe.{least}={wanted}"
             )
         fused = np.concatenate(parts).astype(np.float32)

@@ -14,7 +14,6 @@ import hashlib
 import io
 import pickle
 import tarfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
@@ -24,10 +23,10 @@ import numpy as np
 
 from qs3.classes import ALIASES, CLASSES
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.generation.camera_poses import Count, NotNegative, Positive, direction
-from qs3.geometry.cameras import look_at, rotation_xyz
+from qs3.generation.camera_poses import AnchoredViews
+from qs3.geometry.cameras import rotation_xyz
 from qs3.meshes.mesh import Mesh
-from qs3.utils.settings import settings
+from qs3.utils.settings import NotNegative, settings
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # Blender's cameras look along -z with y up
 _SPLITS = ("train", "test")
@@ -42,23 +41,6 @@ _ARRAYS = {
     ("numpy.core.multiarray", "_reconstruct"),
     ("numpy._core.multiarray", "_reconstruct"),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Where one object and its cameras stood.
-
-    Attributes:
-        scale: the mesh is multiplied by this first ...
-        yaw_rad: ... then turned about z ...
-        location_m: ... then moved by this, [3].
-        world_from_camera: [V, 4, 4], our convention (qs3.geometry.cameras).
-    """
-
-    scale: float
-    yaw_rad: float
-    location_m: np.ndarray
-    world_from_camera: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +65,7 @@ class PoseTable:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the content: the same for an archive and a folder, in any order of files."""
+        """Hash of the content, whatever the order of the files."""
         digest = hashlib.sha256("\n".join(self.ids).encode())
         digest.update(self.objects.astype("<f8").tobytes())
         digest.update(self.cameras.astype("<f8").tobytes())
@@ -93,22 +75,17 @@ class PoseTable:
     def _rows(self) -> dict[str, int]:
         return {name: row for row, name in enumerate(self.ids)}
 
-    def of(self, object_id: str) -> Pose:
-        """The pose of a shape; further scans of a mesh ("id~1") have the pose of the first."""
+    def row(self, object_id: str) -> int:
+        """The number of a shape; further scans of a mesh ("id~1") have the pose of the first."""
         row = self._rows.get(object_id.split("~", 1)[0])
         if row is None:
             raise DataError(f"no pose for {object_id} in the file of poses")
-        scale, yaw, *location = self.objects[row]
-        poses = np.stack([_pose(camera) for camera in self.cameras[row]])
-        return Pose(float(scale), float(yaw), np.array(location), poses)
+        return row
 
 
 @lru_cache(maxsize=4)
 def read_poses(path: Path) -> PoseTable:
-    """Read all poses below a folder or in a .tar.gz (or .tar), as released.
-
-    Args:
-        path: `pose_params.tar.gz`, or a folder with `<class>/<split>/<name>.npy` somewhere below.
+    """Read all poses of `pose_params.tar.gz`, as released.
 
     Raises:
         MissingDataError: it is not there, or holds no pose.
@@ -117,8 +94,11 @@ def read_poses(path: Path) -> PoseTable:
     rows: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     name = ""
     try:
-        for name, data in _files(path):
-            rows[_id_of(PurePosixPath(name))] = _row(_unpickled(data))
+        with tarfile.open(path) as archive:
+            for member in archive:
+                name = member.name
+                if name.endswith(".npy") and (file := archive.extractfile(member)):
+                    rows[_id_of(PurePosixPath(name))] = _row(_unpickled(file.read()))
         if rows:
             ids = tuple(sorted(rows))
             objects, cameras = zip(*(rows[name] for name in ids), strict=True)
@@ -128,18 +108,6 @@ def read_poses(path: Path) -> PoseTable:
     except Exception as error:  # what damaged bytes raise cannot be listed
         raise DataError(f"{path}: {name} holds no poses that can be read: {error}") from error
     raise MissingDataError(f"{path} holds no class/split/name.npy with poses")
-
-
-def _files(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Name and content of each .npy."""
-    if path.is_dir():
-        for one in sorted(path.rglob("*.npy")):
-            yield one.relative_to(path).as_posix(), one.read_bytes()
-        return
-    with tarfile.open(path) as archive:
-        for member in archive:
-            if member.name.endswith(".npy") and (file := archive.extractfile(member)):
-                yield member.name, file.read()
 
 
 def _id_of(name: PurePosixPath) -> str:
@@ -188,14 +156,6 @@ def _row(value: Any) -> tuple[np.ndarray, np.ndarray]:
     return row, cameras
 
 
-def _pose(camera: np.ndarray) -> np.ndarray:
-    """[4, 4] world_from_camera of a Blender camera [6]."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_xyz(camera[3:]) @ _FLIP
-    pose[:3, 3] = camera[:3]
-    return pose
-
-
 @dataclass(frozen=True, eq=False)
 class ReleasedPlacing:
     """Scale, yaw and location of the released poses.
@@ -212,18 +172,18 @@ class ReleasedPlacing:
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str) -> Mesh:
         """A scaled, turned and moved copy; draws nothing."""
-        pose = self.table.of(object_id)
+        scale, yaw_rad, *location_m = self.table.objects[self.table.row(object_id)]
         low, high = mesh.bounds
-        side = float((high - low).max()) * pose.scale
-        c, s = np.cos(pose.yaw_rad), np.sin(pose.yaw_rad)
+        side = float((high - low).max()) * scale
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        middle = turn @ ((low + high) / 2 * pose.scale) + pose.location_m
+        middle = turn @ ((low + high) / 2 * scale) + location_m
         if abs(side - 1) > _MAX_ERROR_M or np.abs(middle).max() > _MAX_ERROR_M:
             raise DataError(
                 f"this is not the mesh that was posed: its largest side is {side:.4g} m, not 1 m, "
                 f"or the middle of its box is at {middle.round(3)} m, not at the origin"
             )
-        return mesh.at(mesh.vertices * pose.scale @ turn.T + pose.location_m)
+        return mesh.at(mesh.vertices * scale @ turn.T + location_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +206,13 @@ class ReleasedViews:
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str
     ) -> list[np.ndarray]:
         """`count` poses [4, 4] world_from_camera; draws nothing, and the box does not matter."""
-        return list(self.table.of(object_id).world_from_camera[: self.count])
+        found = []
+        for camera in self.table.cameras[self.table.row(object_id)][: self.count]:
+            pose = np.eye(4)
+            pose[:3, :3] = rotation_xyz(camera[3:]) @ _FLIP
+            pose[:3, 3] = camera[:3]
+            found.append(pose)
+        return found
 
 
 def pose_file(path: str | None) -> PoseTable | None:
@@ -255,7 +221,7 @@ def pose_file(path: str | None) -> PoseTable | None:
 
 
 @settings
-class GrowingJitterViews:
+class GrowingJitterViews(AnchoredViews):
     """The poses of the released code (and, with `count` 5, of the released pose files).
 
     View 0 looks at the origin. View i (counted from 0) moves each coordinate of its place by a
@@ -263,42 +229,27 @@ class GrowingJitterViews:
     XYZ: added to the angles, not composed with the rotation) by one of sigma
     `turn_sigma_rad * (i + 1) / count`, all clipped; it does not aim again.
 
-    The 5,039 released files say the same. View 0 aims at the origin to 3e-5 degrees. Maximum
-    likelihood of the clipped normal gives 0.0203, 0.0302, 0.0397, 0.0503 m and 0.0399, 0.0592,
-    0.0800, 0.0989 rad for views 1 to 4, the same on every axis and without correlation; 4.8 % of
-    the last view's shifts and 31 % of its turns are 0.1 exactly, which they could not be if the
-    turns were composed. The azimuth covers -90 to 90 degrees evenly.
+    The 5,039 released files agree: maximum likelihood of the clipped normal gives 0.0203, 0.0302,
+    0.0397, 0.0503 m and 0.0399, 0.0592, 0.0800, 0.0989 rad for views 1 to 4. 31 % of the last
+    view's turns are 0.1 exactly, which they could not be if the turns were composed.
 
     Attributes:
-        count: views an object.
-        min_distance_m, max_distance_m, min_elevation_deg, max_elevation_deg: of view 0, uniform.
         min_azimuth_deg, max_azimuth_deg: of view 0, uniform; from the x axis towards y. Objects
             have a random yaw, so half a circle leaves no side of them out.
-        shift_sigma_m, turn_sigma_rad: of the last view.
-        max_shift_m, max_turn_rad: larger draws become this.
+        shift_sigma_m, turn_sigma_rad: of the last view; draws above `max_shift_m` and
+            `max_turn_rad` become that.
     """
 
-    count: Count = 5
-    min_distance_m: Positive = 3.0
-    max_distance_m: Positive = 5.0
-    min_elevation_deg: float = 20.0
-    max_elevation_deg: float = 50.0
     min_azimuth_deg: float = -90.0
     max_azimuth_deg: float = 90.0
     shift_sigma_m: NotNegative = 0.05
     turn_sigma_rad: NotNegative = 0.1
-    max_shift_m: NotNegative = 0.1
-    max_turn_rad: NotNegative = 0.1
 
     def poses(
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
     ) -> list[np.ndarray]:
         """`count` poses [4, 4] world_from_camera around a box [2, 3]; the first is the anchor."""
-        target_m = box_m.mean(axis=0)
-        distance = rng.uniform(self.min_distance_m, self.max_distance_m)
-        elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
-        azimuth = np.deg2rad(rng.uniform(self.min_azimuth_deg, self.max_azimuth_deg))
-        anchor = look_at(target_m + distance * direction(azimuth, elevation), target_m)
+        anchor = self.anchor(rng, box_m)
         angles = euler_xyz(anchor[:3, :3] @ _FLIP)
         poses = [anchor]
         for i in range(1, self.count):
@@ -311,6 +262,10 @@ class GrowingJitterViews:
             pose[:3, :3] = rotation_xyz(turned) @ _FLIP
             poses.append(pose)
         return poses
+
+    def azimuth_rad(self, rng: np.random.Generator) -> float:
+        """From the x axis towards y, within bounds."""
+        return float(np.deg2rad(rng.uniform(self.min_azimuth_deg, self.max_azimuth_deg)))
 
 
 def euler_xyz(rotation: np.ndarray) -> np.ndarray:

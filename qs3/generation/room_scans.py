@@ -12,26 +12,27 @@ from dataclasses import field, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Interval
+from annotated_types import Interval
 from jaxtyping import Bool
 from pydantic import InstanceOf
 
 from qs3.datasets.cutting import Rules, cut, own_pixels, pieces
 from qs3.datasets.depth_images import DepthImage, Pinhole
+from qs3.errors import DataError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
-from qs3.generation.kept import Keep, preview_of, provenance_of, save_view
+from qs3.generation.kept import Keep, provenance_of
 from qs3.generation.materials import LightAbove, MixedMaterials
-from qs3.generation.recipes import Cloud, Count, MaskCrop, TooFewPointsError
+from qs3.generation.recipes import Cloud, MaskCrop
 from qs3.generation.scenes import HAIR_M, Room, around_an_eye
 from qs3.geometry.cameras import Intrinsics, look_at
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.meshes.mesh import Mesh
-from qs3.meshes.placement import Placing, Positive, RealSize, Share
+from qs3.meshes.placement import Placing, RealSize
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Body, Renderer
 from qs3.utils.seeding import object_rng
-from qs3.utils.settings import settings
+from qs3.utils.settings import Count, NotNegative, Positive, Share, settings
 
 _BARE = Keep()
 _AROUND_M = 0.3
@@ -57,11 +58,11 @@ class RoomCamera:
     max_height_m: float = 1.7
     min_distance_m: Positive = 1.3
     max_distance_m: Positive = 4.5
-    clearance_m: Annotated[float, Ge(0)] = 0.6
+    clearance_m: NotNegative = 0.6
     spread: Share = 0.85
     min_pitch_deg: float = -5.0
     max_pitch_deg: float = 40.0
-    roll_deg: Annotated[float, Ge(0)] = 1.5
+    roll_deg: NotNegative = 1.5
     side_deg: Annotated[float, Interval(ge=0, le=180)] = 75.0
 
     def pose(
@@ -112,11 +113,10 @@ class RoomScan:
         mask: how carelessly the mask is drawn; its box is not used, nor its `margin_m`.
         rules: by which it is cut, and when it is refused.
         points: of the final cloud; a smaller one repeats points.
-        torn: probability that of an object which depth edges tear apart only one piece is cut: who
-            splits masks where the depth jumps and joins nothing has a chair's back and its seat as
-            two chairs.
-        worktops: by class the probability that its top is not its own: in kitchens it is labelled
-            as a counter, which leaves of a cabinet its front and maybe a side.
+        torn: probability that of an object which depth edges tear apart only one piece is cut, as
+            where masks are split at jumps of the depth.
+        worktops: by class the probability that its top is not its own, as where kitchens' worktops
+            are labelled as counters.
         attempts: pictures that are taken, each from elsewhere, until one is not refused.
         clean: also make the twin from the true depth of what is seen.
         materials, light: as in `Mesh2Point`; the object has the same materials in every picture.
@@ -160,7 +160,7 @@ class RoomScan:
             bodies = self._bodies(placed, cls, pose, rng, arranging)
             if self.materials is not None:
                 bodies = self.materials.dress(bodies, object_rng(seed, object_id, 0, 1))
-            explain = keep.views is not None
+            explain = keep.view is not None
             frame = self.sensor.scan(bodies, around, pose, renderer, rng, explain, lighting)
             if frame is None:
                 continue
@@ -179,7 +179,7 @@ class RoomScan:
                 assert piece.own is not None
                 return self._cloud(frame, piece.own, pose, object_id, keep)
             why = piece.why
-        raise TooFewPointsError(
+        raise DataError(
             f"none of {self.attempts} pictures (recipe.attempts) shows it well enough; "
             f"of the last one: {why}"
         )
@@ -218,15 +218,14 @@ class RoomScan:
         if self.clean:
             true = frame.points(np.where(own & (frame.label == 1), frame.clean_m, np.nan), pose)
             if not len(true):
-                raise TooFewPointsError("no pixel that was cut shows the object")
+                raise DataError("no pixel that was cut shows the object")
             true = true.astype(np.float32)
             arrays["points_clean"] = true[farthest_point_sampling_np(true, self.points)]
         if keep.provenance:
             arrays["provenance"] = provenance_of(frame, depth, 0)[order]
-        if keep.views is not None:
-            save_view(keep.views, object_id, 0, frame, pose, pose)
-        preview = preview_of(frame) if object_id in keep.previews else {}
-        return Cloud(arrays, 1, len(points), (frame,), preview)
+        if keep.view is not None:
+            keep.view(object_id, 0, frame, pose, pose)
+        return Cloud(arrays, 1, len(points), (frame,))
 
 
 def yaw_between(mesh: Mesh, placed: Mesh) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,21 +39,13 @@ class Scan:
     """
 
     id: str
-    points: np.ndarray
-    clean: np.ndarray | None
+    points: np.ndarray = field(repr=False)
+    clean: np.ndarray | None = field(repr=False)
     views: int
     valid_points: int
-    frames: tuple[DepthFrame, ...] = ()
-    provenance: np.ndarray | None = None
+    frames: tuple[DepthFrame, ...] = field(default=(), repr=False)
+    provenance: np.ndarray | None = field(default=None, repr=False)
     colliders: int = 0
-
-    def __repr__(self) -> str:
-        """In a line, without its arrays."""
-        twin = "" if self.clean is None else ", clean twin"
-        return (
-            f"Scan({self.id!r}, {len(self.points)} points of {self.valid_points} measured, "
-            f"views: {self.views}{twin})"
-        )
 
 
 class Scanner:
@@ -71,13 +63,6 @@ class Scanner:
         return made
 
 
-def composed_recipe(overrides: Sequence[str]) -> DictConfig:
-    """The config of generate.py with these words; ConfigError if a word is wrong."""
-    from qs3.config.compose import composed
-
-    return composed("generate", *overrides)
-
-
 def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[str, Scan]:
     """Scan meshes from memory, one after the other, in this process; nothing is written.
 
@@ -85,7 +70,9 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
         solids: by id.
         overrides: of generate.py, such as ["domain=specklenet10", "renderer=mitsuba"].
     """
-    cfg = composed_recipe(overrides)
+    from qs3.config.compose import composed
+
+    cfg = composed("generate", *overrides)
     scanner = Scanner(cfg)
     return {name: _scan(scanner, name, solid, cfg) for name, solid in solids.items()}
 

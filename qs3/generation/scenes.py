@@ -10,9 +10,8 @@ from annotated_types import Ge
 from pydantic import InstanceOf
 
 from qs3.meshes.mesh import Mesh, merge
-from qs3.meshes.placement import Positive, Share
 from qs3.sensors.renderers.base import Body
-from qs3.utils.settings import settings
+from qs3.utils.settings import Positive, Share, settings
 
 HAIR_M = 1e-4
 """What an object stands on is so far below it: its bottom face is in no other face's plane."""
@@ -184,11 +183,8 @@ class Room:
         nearest = radius + size[:2].max() / 2
         away = nearest + rng.uniform(0.05, 0.5) * max(distance - nearest, 0.1)
         aside = rng.normal(0, radius + 0.2) * np.array([-along[1], along[0]])
-        yaw = rng.uniform(0, 2 * np.pi)
-        c, s = np.cos(yaw), np.sin(yaw)
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * size[:2]
-        ring = corners @ np.array([[c, s], [-s, c]]) + centre[:2] + away * along + aside
-        return prism(ring, floor, floor + float(size[2]))
+        ring = ring_of(size[:2], 4, rng.uniform(0, 2 * np.pi))
+        return prism(ring + centre[:2] + away * along + aside, floor, floor + float(size[2]))
 
 
 def table(
@@ -216,9 +212,19 @@ def rectangle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
 
 
+def ring_of(size: np.ndarray, sides: int, yaw: float) -> np.ndarray:
+    """[n, 2] a rectangle's or an ellipse's outline around 0, counter-clockwise."""
+    if sides == 4:
+        ring = rectangle(-size / 2, size / 2)
+    else:
+        turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+        ring = np.column_stack([np.cos(turn), np.sin(turn)]) * size / 2
+    c, s = np.cos(yaw), np.sin(yaw)
+    return ring @ np.array([[c, s], [-s, c]])
+
+
 def _quad(centre: np.ndarray, height: float, half_m: float) -> Mesh:
-    x, y = centre[:2]
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half_m + [x, y]
+    corners = rectangle(np.full(2, -half_m), np.full(2, half_m)) + centre[:2]
     vertices = np.column_stack([corners, np.full(4, height - HAIR_M)])
     return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 

@@ -36,7 +36,6 @@ COLLIDERS = "colliders left out"
 """Begins the note of an object that had some."""
 DIED = "the worker process died on this object each time (out of memory, or a crash)"
 _DEATHS = 3  # objects in a row
-_PREVIEW = "preview_"
 _LIBRARIES = ("numpy", "opencv-python-headless", "fpsample", "mitsuba", "drjit", "bpy", "trimesh")
 
 
@@ -114,27 +113,19 @@ def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
 def save_part(parts: PartFiles, outcome: Outcome) -> None:
     """Write one outcome, atomically."""
     cloud = outcome.cloud
-    note = {
-        **{key: getattr(outcome, key) for key in ("item_id", "mesh_sha256", "reason", "note")},
-        **{
-            "views": cloud.views if cloud else 0,
-            "valid_points": cloud.valid_points if cloud else 0,
-        },
+    note: dict[str, Any] = {
+        key: getattr(outcome, key) for key in ("item_id", "mesh_sha256", "reason", "note")
     }
-    arrays = dict(cloud.arrays) if cloud else {}
-    if cloud:
-        arrays |= {_PREVIEW + name: image for name, image in cloud.preview.items()}
-    parts.write(_name(outcome.item_id), note, arrays)
+    for key in ("views", "valid_points"):
+        note[key] = getattr(cloud, key) if cloud else 0
+    parts.write(_name(outcome.item_id), note, cloud.arrays if cloud else {})
 
 
 def load_part(parts: PartFiles, item_id: str) -> Outcome:
     """One outcome; its arrays stay on disk until they are asked for."""
-    note, found = parts.open(_name(item_id))
-    seen = [name for name in found if name.startswith(_PREVIEW)]
-    arrays = found.only([name for name in found if name not in seen])
-    preview = {name.removeprefix(_PREVIEW): found[name] for name in seen}
+    note, arrays = parts.open(_name(item_id))
     views, points = note.pop("views"), note.pop("valid_points")
-    cloud = Cloud(arrays, views, points, preview=preview) if arrays else None
+    cloud = Cloud(arrays, views, points) if arrays else None
     return Outcome(cloud=cloud, **note)
 
 
@@ -152,7 +143,7 @@ def renderer_provenance(job: Job) -> dict[str, str]:
     """Renderer, variant and versions, asked in a child process."""
     if not job.recipe.needs_renderer:
         return {}
-    (outcome,) = Processes(1).run(partial(_Inspector, job), [("renderer", None)])
+    (outcome,) = Processes(1).run(partial(_inspector, job), [("renderer", None)])
     if outcome.result is None:
         raise RenderError("the renderer's process died at its start: see `qs3 doctor`")
     provenance, found_out = outcome.result
@@ -162,16 +153,10 @@ def renderer_provenance(job: Job) -> dict[str, str]:
 
 
 def scan_all(job: Job, items: list[MeshItem], pool: Pool) -> Iterator[Outcome]:
-    """Outcomes in the order in which they are done.
-
-    Args:
-        job: what to do.
-        items: with which meshes.
-        pool: the processes that do it, here or elsewhere.
-    """
+    """Outcomes in the order in which they are done."""
     deaths = 0
     if not pool.shared_disk:
-        items = _sent(items, keep_views=job.keep.views is not None)
+        items = _sent(items, keep_views=job.keep.view is not None)
     make_worker = partial(_Scanner, job, saves=pool.shared_disk and pool.at_once > 0)
     tasks = ((item.id, item) for item in items)
     for outcome in pool.run(make_worker, tasks):
@@ -208,15 +193,15 @@ class _Scanner:
         return replace(outcome, cloud=None, saved=True)
 
 
-class _Inspector:
+def _inspector(job: Job) -> Callable[[None], tuple[dict[str, str], dict[str, str]]]:
     """A worker that tells which renderer it has, and what it found out about the machine."""
+    renderer = job.make_renderer()
 
-    def __init__(self, job: Job) -> None:
-        self.renderer = job.make_renderer()
-
-    def __call__(self, _: None) -> tuple[dict[str, str], dict[str, str]]:
+    def inspect(_: None) -> tuple[dict[str, str], dict[str, str]]:
         found_out = {name: value for name, value in os.environ.items() if name.startswith("QS3_")}
-        return self.renderer.provenance(), found_out
+        return renderer.provenance(), found_out
+
+    return inspect
 
 
 def software() -> dict[str, str]:
@@ -230,12 +215,7 @@ def software() -> dict[str, str]:
 
 
 def check_software(expected: Mapping[str, str], found: Mapping[str, str]) -> None:
-    """Raise RenderError on a machine whose clouds would be others.
-
-    Args:
-        expected: of the machine that the command was given on.
-        found: of this one.
-    """
+    """Raise RenderError where this machine's clouds would not be those of the command's."""
     names = sorted({*expected, *found})
     if differs := [name for name in names if found.get(name) != expected.get(name)]:
         pairs = ", ".join(f"{name} ({found.get(name)}, {expected.get(name)})" for name in differs)

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from annotated_types import Gt, Interval
 
 from qs3.errors import MeshError
 from qs3.meshes.mesh import Mesh
-from qs3.utils.settings import settings
-
-Positive = Annotated[float, Gt(0)]
-Share = Annotated[float, Interval(ge=0, le=1)]
+from qs3.utils.settings import Positive, Share, settings
 
 
 @runtime_checkable

@@ -6,23 +6,23 @@ are those that `generate.py` makes of the object.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from qs3.errors import ConfigError
-from qs3.generation.kept import Keep, KeptView, load_views, view_images
-from qs3.generation.plan import mesh_items
+from qs3.generation.kept import Keep, view_images
+from qs3.generation.plan import planned
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import Up, load_mesh
 from qs3.meshes.mesh import Mesh, MeshItem
+from qs3.sensors.base import DepthFrame
 from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, value_image
 from qs3.utils.seeding import object_rng
 
@@ -35,6 +35,15 @@ _SIDE_PX, _PANEL_IN = 800, 2.8
 _SURFACE = 1_000_000  # samples of a mesh, one or two millimetres apart
 
 Picture = tuple[str, Image]
+
+
+class View(NamedTuple):
+    """What `save_view` is given: number, frame, and [4, 4] poses, the true and the believed one."""
+
+    number: int
+    frame: DepthFrame
+    world_from_camera: np.ndarray
+    believed: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +63,7 @@ class ScannedObject:
     name: str
     domain: str
     sensor: str
-    views: tuple[KeptView, ...]
+    views: tuple[View, ...]
     cloud: np.ndarray
     clean: np.ndarray | None
     mesh: Mesh
@@ -97,10 +106,11 @@ def scan_object(
         ConfigError: a setting is wrong, or there is no such object.
         MeshError, RenderError, DataError: it cannot be scanned.
     """
+    from qs3.config.compose import composed
     from qs3.config.hydra import build
-    from qs3.generation.scan import Scanner, composed_recipe
+    from qs3.generation.scan import Scanner
 
-    cfg = composed_recipe(overrides)
+    cfg = composed("generate", *overrides)
     scanner = Scanner(cfg)
     recipe, renderer = scanner.recipe, str((cfg.get("renderer") or {}).get("name", ""))
     if mesh is not None:
@@ -109,23 +119,22 @@ def scan_object(
         load = partial(load_mesh, path, keep_colliders=cfg.colliders == "keep", up=up)
         item = MeshItem(object_id or path.stem, "", "train", load, path.name, path)
     else:
-        items = {item.id: item for item in mesh_items(cfg)}
+        items = {item.id: item for item in planned(cfg).items}
         name = object_id or (_OFTEN_THERE if _OFTEN_THERE in items else next(iter(items)))
         if name not in items:
             raise ConfigError(f"object={name} is not in the domain; it has {next(iter(items))}")
         item = items[name]
     loaded, looks = item.load(), recipe.needs_renderer
-    with tempfile.TemporaryDirectory(prefix="qs3-pipeline-") as folder:
-        keep = Keep(views=Path(folder)) if looks else Keep()
-        made = scanner.cloud(loaded, item.id, keep).arrays
-        views = load_views(Path(folder), item.id)
+    views: list[View] = []
+    keep = Keep(view=lambda _, *seen: views.append(View(*seen))) if looks else Keep()
+    made = scanner.cloud(loaded, item.id, keep).arrays
     shown = ("domain=", "renderer=", "paths.", "workers=")
     changed = [word for word in overrides if not word.startswith(shown)]
     label = build(cfg.domain).label + (f" with {' '.join(changed)}" if changed else "")
     sensor = f"{type(recipe.sensor).__name__} rendered by {renderer.capitalize()}" if looks else ""
     placed = recipe.placing.place(loaded, object_rng(cfg.seed, item.id, 0), item.id)
     clouds = made["points"], made.get("points_clean")
-    return ScannedObject(item.id, label, sensor, views, *clouds, placed)
+    return ScannedObject(item.id, label, sensor, tuple(views), *clouds, placed)
 
 
 def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:

@@ -6,7 +6,7 @@
 The work is mostly a dataset, whose folder holds as well
 
     views/        images and depths of every view, if they were asked for
-    clouds.png, infrared.png, config.yaml
+    clouds.png, config.yaml
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from qs3.utils.files import (
 )
 
 RECIPE, PARTS, VIEWS = "recipe.json", "parts", "views"
-CLOUDS, INFRARED, CONFIG = "clouds.png", "infrared.png", "config.yaml"
+CLOUDS, CONFIG = "clouds.png", "config.yaml"
 
 _MOST_LINES = 12
 
@@ -129,10 +129,6 @@ class ArraysOnDisk(Mapping[str, np.ndarray]):
     def __init__(self, path: Path, names: Sequence[str]) -> None:
         self._path, self._names = path, list(names)
 
-    def only(self, names: Sequence[str]) -> ArraysOnDisk:
-        """Some of them."""
-        return ArraysOnDisk(self._path, names)
-
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._names:
             raise KeyError(name)
@@ -163,7 +159,7 @@ def delete_dataset(folder: Path) -> None:
     for name in (PARTS, VIEWS):
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
-    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG)
+    names = ("manifest.csv", CLOUDS, CONFIG)
     for path in [*(folder / name for name in names), *folder.glob("*.npy"), folder / RECIPE]:
         path.unlink(missing_ok=True)
 

@@ -13,6 +13,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from qs3.errors import ConfigError, DataError, MissingDataError, RenderError
 from qs3.generation.command import generate
@@ -195,6 +196,28 @@ def test_surface_samples_lie_on_the_surface_and_dropout_takes_regions(meshes, tm
             assert gap[1] > gap[0] + 10
 
 
+def test_a_finished_dataset_has_its_picture_and_config(finished, meshes):
+    folder, pointset = finished
+    assert np.asarray(Image.open(folder / "clouds.png").convert("RGB")).std() > 10
+    assert f"data_dir: {folder.parent}" in (folder / "config.yaml").read_text()
+    assert pointset.meta["config"]["classes"] == ["chair", "table", "lamp"]
+    assert pointset.meta["config"]["test_fraction"] == 0.2
+    assert str(folder.parent) not in (folder / "meta.yaml").read_text()
+
+
+def test_force_takes_old_views_away(meshes, tmp_path):
+    folder = tmp_path / "modelnet10"
+    generate(config(tmp_path, meshes, "workers=0", domain="modelnet10"))
+    (folder / "views" / "chair").mkdir(parents=True)
+    (folder / "mine.txt").write_text("kept")
+    generate(config(tmp_path, meshes, "workers=0", "force=true", domain="modelnet10"))
+    assert {path.name for path in folder.iterdir()} == {
+        ".lock", "clouds.png", "config.yaml", "manifest.csv", "meta.yaml", "mine.txt", "points.npy",
+        "recipe.json",
+    }  # fmt: skip
+    assert len(open_pointset(folder)) == 9
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("limit", "more"), [(20_000, []), (420_000, ["scans=2"])], ids=["parts", "dataset"]
@@ -254,7 +277,7 @@ def test_kill_at_random_instants_changes_no_byte(meshes, tmp_path, victim, keep)
         for path in (tmp_path / "whole").rglob("*")
         if path.is_file()
     }
-    assert len(whole) == (9 if not keep else 10 + 9 * 2 * 2)
+    assert len(whole) == (8 if not keep else 9 + 9 * 2 * 2)
     for path, content in whole.items():
         if path.name != "config.yaml":  # with the folder
             assert (tmp_path / path).read_bytes() == content, path

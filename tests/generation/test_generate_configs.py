@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from qs3.classes import CLASSES
 from qs3.errors import ConfigError
 from qs3.generation.camera_poses import AnchoredViews
-from qs3.generation.plan import mesh_items, planned
+from qs3.generation.plan import planned
 from qs3.generation.scenes import Alone, Room
 from tests.generation.generating import composed as config
 
@@ -54,6 +54,10 @@ def test_source_and_stand_in_share_no_mesh_no_pattern_no_matcher_and_no_noise():
         for name in ("specklenet10", "kinectsim10")
     ]
     assert not hashes[0] & hashes[1]
+
+
+def mesh_items(cfg):
+    return planned(cfg).items
 
 
 def benchmark(*words, domain="kinectsim10"):

@@ -101,9 +101,9 @@ def test_names_are_joined_with_ours(poses):
     table = read_poses(poses)
     assert table.ids == ("cabinet/train/night_stand_0001", ID)
     assert table.views == 5
-    assert table.of(ID + "~2").yaw_rad == table.of(ID).yaw_rad  # a further scan
+    assert table.row(ID + "~2") == table.row(ID) == 1  # a further scan
     with pytest.raises(DataError, match="sofa/test/other"):
-        table.of("sofa/test/other")
+        table.row("sofa/test/other")
 
 
 def test_objects_and_cameras_stand_where_the_file_says(poses):
