@@ -11,11 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import torch
 from torch import Tensor
 
 from qs3.kernels.device import exporting
 
 _plain = False
+_COMPILED = (torch.float32, torch.float64)  # types of the CPU's kernels
 
 
 def on_cpu(x: Tensor) -> bool:
@@ -31,7 +33,8 @@ def usable(x: Tensor, *, anywhere: bool = False, traceable: bool = False) -> boo
         anywhere: the kernel serves on every device, not on the CPU alone.
         traceable: it may be exported as well.
     """
-    return (anywhere or on_cpu(x)) and not _plain and (traceable or not exporting())
+    here = x.dtype in _COMPILED if on_cpu(x) else anywhere
+    return here and not _plain and (traceable or not exporting())
 
 
 def is_plain() -> bool:

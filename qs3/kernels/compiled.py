@@ -1,8 +1,7 @@
 """EdgeConv along its edges, nearest neighbours, and maxima of linear layers backwards, compiled.
 
 By torch's operations the gathered rows are written and read again, k times the size of the result;
-here it is one loop. Off the CPU callers go by torch's operations, with the same values, and
-gradients whose sums are in another order.
+here it is one loop. For float32 and float64 on the CPU; elsewhere callers go by torch's operations.
 """
 
 from __future__ import annotations
@@ -20,21 +19,10 @@ _ALONE = 1 << 16  # values that are too few to be shared by threads
 _BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
 
 
-def usable(x: Tensor) -> bool:
-    """Whether the operations of this module may be called for `x`."""
-    return x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
-
-
-@torch.library.custom_op("qs3::neighbour_max", mutates_args=())
 def neighbour_max(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum over each row's neighbours, per channel, as torch's: NaN is above all.
+    """Maximum [q, c] over each row's neighbours index [q, k] in x [p, c]; NaN is above all.
 
-    Args:
-        x: [p, c] float32 or float64.
-        index: [q, k] int64, rows of `x`.
-
-    Returns:
-        [q, c], and int32 [q, c]: the first of its neighbours that has it (of NaN: one that is).
+    And int32 [q, c]: the first of its neighbours that has it (of NaN: one that is).
     """
     best = x.new_empty(len(index), x.shape[1])
     where = torch.empty(best.shape, dtype=torch.int32)
@@ -42,15 +30,6 @@ def neighbour_max(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     return best, where
 
 
-neighbour_max.register_fake(
-    lambda x, index: (
-        x.new_empty(len(index), x.shape[1]),
-        x.new_empty(len(index), x.shape[1], dtype=torch.int32),
-    )
-)
-
-
-@torch.library.custom_op("qs3::neighbour_max_backward", mutates_args=())
 def neighbour_max_backward(grad: Tensor, where: Tensor, points: int) -> Tensor:
     """The gradient [points, c] of `x`, from that of the maxima [q, c] and their rows."""
     out = grad.new_zeros(points, grad.shape[1])
@@ -58,12 +37,6 @@ def neighbour_max_backward(grad: Tensor, where: Tensor, points: int) -> Tensor:
     return out
 
 
-neighbour_max_backward.register_fake(
-    lambda grad, where, points: grad.new_empty(points, grad.shape[1])
-)
-
-
-@torch.library.custom_op("qs3::add_to_neighbours", mutates_args=())
 def add_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
     """A'x: each row of x [q, c] added to the rows that index [q, k] names, [q, c]."""
     out = x.new_zeros(x.shape)
@@ -71,23 +44,12 @@ def add_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
     return out
 
 
-add_to_neighbours.register_fake(lambda x, index: x.new_empty(x.shape))
-
-
-@torch.library.custom_op("qs3::linear_max_backward", mutates_args=())
 def linear_max_backward(
     x: Tensor, weight: Tensor, grad: Tensor, where: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Gradients of the maximum of x W' over the rows of each cloud, of x and of W.
+    """Gradients of x [b, n, c] and W [d, c] of the maximum of x W' over the rows of each cloud.
 
-    Args:
-        x: [b, n, c].
-        weight: [d, c].
-        grad: [b, d], of the maxima.
-        where: [b, d] int64, the row of its cloud that has each.
-
-    Returns:
-        [b, n, c] and [d, c].
+    From that of the maxima [b, d], and the rows of their clouds that have them, [b, d] int64.
     """
     dx, dweight = x.new_zeros(x.shape), weight.new_zeros(weight.shape)
     values = grad.numel() * x.shape[2]
@@ -95,26 +57,16 @@ def linear_max_backward(
     return dx, dweight
 
 
-linear_max_backward.register_fake(
-    lambda x, weight, *_: (x.new_empty(x.shape), weight.new_empty(weight.shape))
-)
-
-
-@torch.library.custom_op("qs3::smallest_sums", mutates_args=("values",))
 def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     """Columns of the k smallest values of each row after `more` was added to them, smallest first.
 
-    Columns are dealt to groups; the k-th smallest of the groups' minima is no less than the k-th
-    smallest of the row, so everything above it is out, which leaves hardly more than k to be
-    sorted. Of equal values the first columns come first, on all processors.
+    Columns are dealt to groups; everything above the k-th smallest of the groups' minima is out,
+    which leaves hardly more than k to be sorted. Of equal values the first columns come first.
 
     Args:
         values: [r, n] contiguous; the sums afterwards.
         more: [c, n], of the first r / c rows, the next ones, ...
-        k: at most `n`.
-
-    Returns:
-        int64 [r, k].
+        k: at most `n`; the result is int64 [r, k].
     """
     (r, n), groups = values.shape, groups_for(k)
     minima = values.new_empty(r, groups)
@@ -132,11 +84,6 @@ def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     return out
 
 
-smallest_sums.register_fake(
-    lambda values, more, k: values.new_empty(len(values), k, dtype=torch.int64)
-)
-
-
 def _kth_smallest(x: Tensor, k: int) -> Tensor:
     """The k-th smallest of each row of x [r, n], [r]; NaN is above all."""
     kind, infinite = _BITS[x.dtype], torch.tensor(torch.inf, dtype=x.dtype)
@@ -152,6 +99,7 @@ def groups_for(k: int) -> int:
     return 64 * -(-k // 32)
 
 
+@torch.compiler.disable
 def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:
     """Call a kernel on parts of its range, one for each of torch's threads."""
     from qs3.kernels import numba_kernels

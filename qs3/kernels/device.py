@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -32,6 +33,12 @@ def triton_kernels(module: str, x: Tensor) -> Any:
     return import_module(f"qs3.kernels.{module}")
 
 
+def implementation(module: str, kernels: str, x: Tensor) -> Any:
+    """Where a module's operations are taken from: the kernels save an operation's own way."""
+    compiling = torch.compiler.is_compiling()  # whose graph has operations
+    return (not compiling and triton_kernels(kernels, x)) or sys.modules[module]
+
+
 @contextmanager
 def exact_products() -> Iterator[None]:
     """Inside, float32 products are of float32 factors, whatever `trainer.float32_matmul` says.
@@ -53,10 +60,6 @@ def lists_of(
     index: Int[Tensor, "*b m"], rows: int
 ) -> tuple[Int[Tensor, "*b {rows}+1"], Int[Tensor, "*b m"]]:
     """Which entries of `index` name each row, in their order.
-
-    Args:
-        index: numbers of rows.
-        rows: how many rows there are.
 
     Returns:
         first: where in `order` the list of each row begins, and the last one ends.

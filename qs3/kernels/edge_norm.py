@@ -21,7 +21,6 @@ lest squares of deviations from it cancel.
 
 # No `from __future__ import annotations`: torch reads the operations' annotations, and where shapes
 # are checked (`make test-all`) it would look their words up in another module.
-import sys
 from typing import Any, no_type_check
 
 import torch
@@ -30,7 +29,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from qs3.kernels.device import ROWS, lists_of, triton_kernels
+from qs3.kernels.device import ROWS, implementation, lists_of, triton_kernels
 
 MOST_NEIGHBOURS = 256  # which was taken is kept in a byte
 _SHARE = 16
@@ -45,14 +44,10 @@ def edge_extremes(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """What the layer needs of its edges.
 
-    Args:
-        pr: [r, 2 d], P and R of the points.
-        index: int64 [r, k], rows of each point's neighbours.
-        gamma: [d]; where it is negative the least z is taken.
-        pivot: [d].
+    Of P and R [r, 2 d], rows of each point's neighbours [r, k], gamma and pivot [d].
 
     Returns:
-        best: the greatest (or least) z of each point less pivot, [r, d].
+        best: the greatest z of each point less pivot, the least where gamma < 0, [r, d].
         taken: which neighbour has it, uint8 [r, d], the first such.
         sums: of P over the neighbours, [r, d].
         own: Q - pivot, [r, d].
@@ -91,18 +86,10 @@ def edge_output(
     eps: float,
     negative_slope: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The layer's output.
-
-    Args:
-        best: [r, d], of `edge_extremes`.
-        sums: [2, d], its parts' sums.
-        pivot, gamma, beta: [d].
-        edges: M.
-        eps, negative_slope: of the norm and of LeakyReLU.
+    """Of `best` and the sums [2, d] of its parts: the layer's output.
 
     Returns:
-        y: [r, d].
-        t: [r, d].
+        y, t: [r, d] each.
         constants: [5, d]: mean, var, 1 / sigma, h, and mean - pivot.
     """
     if kernels := triton_kernels(_TRITON, best):
@@ -128,16 +115,9 @@ edge_output.register_fake(
 def edge_output_gradient(
     grad: Tensor, y: Tensor, t: Tensor, constants: Tensor, negative_slope: float
 ) -> tuple[Tensor, Tensor]:
-    """The gradient before LeakyReLU.
+    """Of the gradient of y [r, d]: du, that before LeakyReLU, and parts of dbeta and dgamma.
 
-    Args:
-        grad: of y, [r, d].
-        y, t, constants: of `edge_output`.
-        negative_slope: of LeakyReLU.
-
-    Returns:
-        du: [r, d].
-        parts: sums over some points of what dbeta and dgamma are sums of, [2, parts, d].
+    The parts are sums over some points, [2, parts, d].
     """
     if kernels := triton_kernels(_TRITON, y):
         return kernels.edge_output_gradient(grad, y, t, constants, negative_slope)
@@ -162,15 +142,10 @@ def edge_gradient(
     constants: Tensor,
     of_norm: Tensor,
 ) -> Tensor:
-    """The gradient of `pr` [r, 2 d].
+    """The gradient of `pr` [r, 2 d], from what the other operations gave.
 
-    Args:
-        pr, own, taken, sums: of `edge_extremes`.
-        du: [r, d], of `edge_output_gradient`.
-        first: [r + 1], where in `order` the edges that lead to each point begin.
-        order: int64 [r k], edges (i k + j) in the order of the points that they lead to.
-        constants: [5, d], of `edge_output`.
-        of_norm: [2, d], dbeta and dgamma.
+    `order` int64 [r k] has edges (i k + j) in the order of the points that they lead to, `first`
+    [r + 1] where those of each point begin; `of_norm` [2, d] is dbeta and dgamma.
     """
     if kernels := triton_kernels(_TRITON, pr):
         return kernels.edge_gradient(pr, own, du, taken, sums, first, order, constants, of_norm)
@@ -202,7 +177,7 @@ class _EdgeNorm(torch.autograd.Function):
         eps: float,
         slope: float,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        at = _implementation(pr)
+        at = implementation(__name__, _TRITON, pr)
         # Of some points, which decide nothing but the rounding: of a share s of all their mean is
         # off by at most sqrt((1 - s) / s) deviations.
         pivot = pr[: -(-len(pr) // _SHARE), len(gamma) :].mean(0)
@@ -220,7 +195,7 @@ class _EdgeNorm(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         pr, index, taken, sums, own, t, y, constants = ctx.saved_tensors
-        at = _implementation(pr)
+        at = implementation(__name__, _TRITON, pr)
         du, parts = at.edge_output_gradient(grad.contiguous(), y, t, constants, ctx.slope)
         of_norm = parts.sum(1)
         first, order = lists_of(index.flatten(), len(pr))
@@ -238,29 +213,15 @@ def edge_norm(
 ) -> tuple[Float[Tensor, "r d"], Float[Tensor, " d"], Float[Tensor, " d"]]:
     """The layer's output, and mean and biased variance of z over all edges, without gradients.
 
-    Args:
-        pr: P and R of all points.
-        index: rows of each point's neighbours, at most `MOST_NEIGHBOURS`.
-        gamma, beta, eps: of the batch norm.
-        negative_slope: of LeakyReLU, at least 0.
+    Of P and R of all points, and rows of each point's neighbours, at most `MOST_NEIGHBOURS`; the
+    slope is at least 0.
     """
     return _EdgeNorm.apply(pr.contiguous(), index.contiguous(), gamma, beta, eps, negative_slope)
 
 
 def edge_maximum(pr: Float[Tensor, "r c"], index: Int[Tensor, "r k"]) -> Float[Tensor, "r d"]:
-    """The greatest z of each point; without a way back.
-
-    Args:
-        pr: P and R of all points.
-        index: rows of each point's neighbours, at most `MOST_NEIGHBOURS`.
-    """
+    """The greatest z of each point, as in `edge_norm`; without a way back."""
     d = pr.shape[1] // 2
-    at = _implementation(pr)
+    at = implementation(__name__, _TRITON, pr)
     best = at.edge_extremes(pr, index.contiguous(), pr.new_ones(d), pr.new_zeros(d))[0]
     return best
-
-
-def _implementation(x: Tensor) -> Any:
-    """Where the operations are taken from: the kernels themselves save an operation's own way."""
-    compiling = torch.compiler.is_compiling()  # whose graph has operations
-    return (not compiling and triton_kernels(_TRITON, x)) or sys.modules[__name__]

@@ -34,14 +34,11 @@ from torch.nn import functional as F
 
 from qs3 import kernels as fast
 from qs3.kernels import compiled
-from qs3.kernels.device import exporting, lists_of, takes_triton
+from qs3.kernels.device import exporting, takes_triton
 from qs3.kernels.edge_norm import MOST_NEIGHBOURS, edge_maximum, edge_norm
 from qs3.kernels.matmul import linear
 from qs3.kernels.norms import active, normed, running, track, uses_batch
-from qs3.kernels.pointwise_max import max_over_members, max_over_rows
-
-_GATHERED = 1 << 20  # values gathered at once on the CPU: 4 MB in float32
-_ON_DEVICE = 1 << 28  # elsewhere: 1 GB, so that a batch is mostly one kernel
+from qs3.kernels.pointwise_max import max_over_members
 
 
 class _NeighbourMax(torch.autograd.Function):
@@ -50,20 +47,7 @@ class _NeighbourMax(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, index: Tensor) -> Tensor:
         ctx.points = x.shape[0]
-        if compiled.usable(x):
-            out, where = compiled.neighbour_max(x, index)
-            ctx.save_for_backward(where)
-            return out
-        rows, k = index.shape
-        channels = x.shape[1]
-        out = torch.empty(rows, channels, dtype=x.dtype, device=x.device)
-        where = torch.empty(rows, channels, dtype=torch.int64, device=x.device)
-        block = max(64, (_GATHERED if fast.on_cpu(x) else _ON_DEVICE) // (k * channels))
-        for i in range(0, rows, block):
-            part = index[i : i + block]
-            best, j = max_over_rows(x.index_select(0, part.reshape(-1)).view(-1, k, channels))
-            out[i : i + block] = best
-            torch.gather(part, 1, j, out=where[i : i + block])
+        out, where = compiled.neighbour_max(x, index)
         ctx.save_for_backward(where)
         return out
 
@@ -71,10 +55,7 @@ class _NeighbourMax(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (where,) = ctx.saved_tensors
-        if compiled.usable(grad):
-            return compiled.neighbour_max_backward(grad, where, ctx.points), None
-        out = grad.new_zeros(ctx.points, grad.shape[1])
-        return out.scatter_add_(0, where, grad), None
+        return compiled.neighbour_max_backward(grad, where, ctx.points), None
 
 
 class _Moments(torch.autograd.Function):
@@ -102,26 +83,14 @@ class _Moments(torch.autograd.Function):
         dx.add_(d_second[:, None])
         dx.baddbmm_(x, d_xx + d_xx.transpose(1, 2))
         dx.baddbmm_(sums, d_xax.transpose(1, 2))
-        upstream = (x @ d_xax).flatten(0, 1)
-        if compiled.usable(x):
-            return dx.add_(compiled.add_to_neighbours(upstream, index).view_as(dx)), None
-        return dx.add_(_added_to_neighbours(upstream, index).view_as(dx)), None
-
-
-def _added_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
-    """A'x: each row of x [q, c] added to the rows that index [q, k] names, [q, c].
-
-    By lists of who names each row: `embedding_bag` sums them without laying their rows out, where
-    `index_add_` takes one pass over x and the sums for each of the k columns.
-    """
-    first, order = lists_of(index.flatten(), len(x))
-    return F.embedding_bag(order // index.shape[1], x, first[:-1], mode="sum")
+        upstream = compiled.add_to_neighbours((x @ d_xax).flatten(0, 1), index)
+        return dx.add_(upstream.view_as(dx)), None
 
 
 def neighbour_max(x: Float[Tensor, "p c"], index: Int[Tensor, "q k"]) -> Float[Tensor, "q c"]:
     """Maximum over each row's neighbours, per channel."""
-    if exporting():  # where blocks would bind the graph to a number of points
-        return x.index_select(0, index.flatten()).view(*index.shape, x.shape[1]).amax(1)
+    if exporting() or not fast.on_cpu(x):
+        return max_over_members(x.index_select(0, index.flatten()).view(*index.shape, x.shape[1]))
     return _NeighbourMax.apply(x, index)
 
 
@@ -139,16 +108,9 @@ def edge_conv(
     norm: nn.Module,
     negative_slope: float,
 ) -> Float[Tensor, "b n d"]:
-    """The layer's output; traceable unless the norm `uses_batch`.
+    """The layer's output; traceable unless the norm (of `make_norm`) `uses_batch`.
 
-    On the CPU the norm is `track`ed, never called.
-
-    Args:
-        x: features of the points, in the dtype of `weight`.
-        index: neighbours of each.
-        weight: [W1 | W2].
-        norm: from `make_norm`.
-        negative_slope: of LeakyReLU.
+    x is in the dtype of `weight`, which is [W1 | W2]. On the CPU the norm is `track`ed, not called.
     """
     b, n, c = x.shape
     k = index.shape[2]

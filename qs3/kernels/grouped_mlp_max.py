@@ -59,23 +59,15 @@ def grouped_mlp_max(
     weights = [weights[0][:, :3], *weights[1:]]
     if isinstance(norms[0], nn.InstanceNorm1d):
         parts = zip(xyz, centres, [None] * len(xyz) if p is None else p, index, strict=True)
-        return torch.stack([_groups(*cloud, weights, norms) for cloud in parts])
+        return torch.stack([_groups(*cloud, weights=weights, norms=norms) for cloud in parts])
     first = torch.arange(len(xyz), device=xyz.device)[:, None, None] * xyz.shape[1]
     flat = None if p is None else p.flatten(0, 1)
-    rows = (index + first).flatten(0, 1)
-    out = _groups(xyz.flatten(0, 1), centres.flatten(0, 1), flat, rows, weights, norms)
-    return out.unflatten(0, centres.shape[:2])
+    rows = xyz.flatten(0, 1), centres.flatten(0, 1), flat, (index + first).flatten(0, 1)
+    return _groups(*rows, weights=weights, norms=norms).unflatten(0, centres.shape[:2])
 
 
-def _groups(
-    xyz: Tensor,
-    centres: Tensor,
-    p: Tensor | None,
-    index: Tensor,
-    weights: Sequence[Tensor],
-    norms: Sequence[nn.Module],
-) -> Tensor:
-    """The same of points [R, 3] and groups [G] of all clouds in one list: [G, D]."""
+def _groups(*points: Tensor | None, weights: Sequence[Tensor], norms: Sequence[Any]) -> Tensor:
+    """The same of xyz, centres, p and index of all clouds in one list: [G, D]."""
     plain = [active(norm) for norm in norms]
     running = [None if uses_batch(n) else (n.running_mean, n.running_var) for n in plain]
     parameters = [
@@ -83,10 +75,9 @@ def _groups(
         for weight, norm in zip(weights, plain, strict=True)
         for part in (weight, norm.weight, norm.bias)
     ]
-    eps = plain[0].eps
-    out, *found = _GroupedMaximum.apply(xyz, centres, p, index, eps, running, *parameters)
+    out, *found = _GroupedMaximum.apply(*points, plain[0].eps, running, *parameters)
     for norm, mean, var in zip(plain, found[::2], found[1::2], strict=True):
-        track(norm, mean, var, index.numel())
+        track(norm, mean, var, points[-1].numel())  # type: ignore[union-attr]
     return out
 
 
@@ -149,8 +140,7 @@ class _Layer:
 class _Rows:
     """Sums over rows [..., C] that come in parts, in float64 about a first guess of their mean.
 
-    Args:
-        products: sum y'y too, instead of the squares alone.
+    With `products` of y'y instead of the squares alone.
     """
 
     def __init__(self, *, products: bool = False) -> None:
@@ -186,10 +176,9 @@ class _Rows:
 class _GroupedMaximum(torch.autograd.Function):
     """See the module. All rows lie as [groups, members, channels].
 
-    From the points [R, 3], the groups' centres [G, 3], the first convolution of the points'
-    features [R, C] or None, the groups' rows [G, K], the norms' eps, for each norm its mean and
-    variance or None (then the members'), and each layer's weight, gamma and beta. To [G, D], and
-    mean and biased variance of each norm's input, without gradient.
+    `p` is the first convolution of the points' features, `running` each norm's mean and variance or
+    None (then the members'), `parameters` each layer's weight, gamma and beta. To [G, D], and mean
+    and biased variance of each norm's input, without gradient.
     """
 
     @staticmethod
@@ -267,6 +256,7 @@ class _GroupedMaximum(torch.autograd.Function):
         groups, members = index.shape
         rows = groups * members
         grads: list[Tensor] = []  # of beta, gamma, weight, from the last layer to the first
+        none = xyz.new_zeros(2, 1)
 
         # the last layer: nothing has its width but one row a group
         last, weight = layers[-1], weights[-1]
@@ -282,34 +272,34 @@ class _GroupedMaximum(torch.autograd.Function):
             # the mean of z - mean(z) is zero, so that only the covariance is left of Y'Y
             dweight += b[:, None] * (weight @ (ctx.cov * rows).to(weight.dtype))
             dweight += torch.outer(a, mean * rows)
-        make, sums = _maker(source, layers[:-1], z, parts), _Sums()
+        make, sums = _maker(source, layers[:-1], z, parts), none
         dy: list[Tensor] = []
         for i, part in enumerate(parts):
             y = make(i)
             out = matmul_t(y, product, bias) if ctx.training[-1] else torch.zeros_like(y)
             _at_maxima(out, dweight, y, weight, at_max[part], where[part])
             out.mul_(y > 0)
-            sums.add(out, z[len(z) - len(parts) + i] if z else source(part))
+            sums = sums + _sums(out, z[i - len(parts)] if z else source(part))
             dy.append(out)
         grads += [dbeta, dgamma, dweight]
 
         while z:  # the layers between
             here, z = z[-len(parts) :], z[: -len(parts)]
             level = len(z) // len(parts) + 1
-            dgamma, dbeta, *affine = layers[level].gradient(*sums.result(), rows)
+            dgamma, dbeta, *affine = layers[level].gradient(sums[0], sums[1], rows)
             weight, transposed = weights[level], weights[level].T.contiguous()
-            make, sums = _maker(source, layers[:level], z, parts), _Sums()
+            make, sums = _maker(source, layers[:level], z, parts), none
             dweight = torch.zeros_like(weight)
             for i, part in enumerate(parts):
                 dz = _dz(dy[i], here[i], affine, ctx.training[level])
                 y = make(i)
                 dweight += t_matmul(dz.flatten(0, 1), y.flatten(0, 1))
                 out = matmul_t(dz, transposed).mul_(y > 0)
-                sums.add(out, z[len(z) - len(parts) + i] if z else source(part))
+                sums = sums + _sums(out, z[i - len(parts)] if z else source(part))
                 dy[i] = out
             grads += [dbeta, dgamma, dweight]
 
-        dgamma, dbeta, *affine = layers[0].gradient(*sums.result(), rows)
+        dgamma, dbeta, *affine = layers[0].gradient(sums[0], sums[1], rows)
         needs_xyz, needs_centres, needs_p = ctx.needs_input_grad[:3]
         dxyz = torch.zeros_like(xyz) if needs_xyz else None
         dcentres = torch.zeros_like(centres) if needs_centres else None
@@ -332,30 +322,15 @@ class _GroupedMaximum(torch.autograd.Function):
         return dxyz, dcentres, dp, None, None, None, *grads[::-1]
 
 
-class _Sums:
-    """Sums of dy and of dy z over all rows, by channel."""
-
-    def __init__(self) -> None:
-        self.first: Tensor | float = 0.0
-        self.second: Tensor | float = 0.0
-
-    def add(self, dy: Tensor, z: Tensor) -> None:
-        """Some more rows: [..., C]."""
-        self.first = self.first + dy.sum((0, 1))
-        self.second = self.second + (dy * z).sum((0, 1))
-
-    def result(self) -> tuple[Tensor, Tensor]:
-        """[C] each."""
-        assert isinstance(self.first, Tensor)
-        assert isinstance(self.second, Tensor)
-        return self.first, self.second
+def _sums(dy: Tensor, z: Tensor) -> Tensor:
+    """[2, C] sums of dy and of dy z over all rows."""
+    return torch.stack([dy.sum((0, 1)), (dy * z).sum((0, 1))])
 
 
 def _parts(groups: int, values: int) -> list[slice]:
     """Groups in parts of about `_AT_ONCE` values, `values` a group, and larger of several threads.
 
-    Each operation on a part wakes them, and they sleep where they wait (`qs3.utils.processor`):
-    with two threads and one thread's parts a step took 1.7 times as long as with one thread.
+    Each operation on a part wakes them: with two threads small parts took 1.7 times as long.
     """
     threads = torch.get_num_threads()
     step = max(1, _AT_ONCE * (4 * threads if threads > 1 else 1) // values)

@@ -1,6 +1,6 @@
-"""Maximum and mean over points of a linear layer as few operations of an accelerator.
+"""Maximum and mean over points of a linear layer, on the CPU and as few operations elsewhere.
 
-`qs3.kernels.pointwise_max` has the CPU's way. Of z = W x one point of each cloud has a
+Of z = W x one point of each cloud has a
 channel's maximum, so D, the gradient of z at the maxima, has one entry a cloud and channel:
 
     dx_r = sum over the channels whose maximum r has, of D W_channel,
@@ -13,7 +13,6 @@ takes torch's operations, and so says what the kernel computes.
 
 # No `from __future__ import annotations`: torch reads the operations' annotations, and where shapes
 # are checked (`make test-all`) it would look their words up in another module.
-import sys
 from typing import Any
 
 import torch
@@ -21,10 +20,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from qs3.kernels.device import lists_of, triton_kernels
+from qs3 import kernels as fast
+from qs3.kernels import compiled
+from qs3.kernels.device import implementation, lists_of, triton_kernels
+from qs3.kernels.matmul import matmul_t
+from qs3.kernels.pointwise_max import max_over_rows
 
 _op = torch.library.custom_op
 _TRITON = "triton_linear_max"
+_AT_ONCE = 1 << 22  # values of z at once on the CPU: 16 MB in float32
 
 
 @_op("qs3::linear_max_gradient", mutates_args=())
@@ -37,8 +41,8 @@ def points_gradient(
         grad: D at its beginning, [b, at least d].
         weight: [d, c].
         beside: [b, c], of which each of a cloud's n points has its share.
-        first: [b, n + 1], where in `order` the channels begin whose maximum a point has.
-        order: int64 [b, d], channels in the order of the points that have their maxima.
+        first, order: channels in the order of the points that have their maxima, int64 [b, d], and
+            where those of a point begin, [b, n + 1].
     """
     if kernels := triton_kernels(_TRITON, weight):
         return kernels.points_gradient(grad, weight, beside, first, order)
@@ -59,14 +63,7 @@ points_gradient.register_fake(
 
 @_op("qs3::linear_max_weight_gradient", mutates_args=())
 def weight_gradient(grad: Tensor, x: Tensor, where: Tensor, base: Tensor) -> Tensor:
-    """The gradient of W [d, c].
-
-    Args:
-        grad: D at its beginning, [b, at least d].
-        x: [b, n, c].
-        where: int64 [b, d], which point of the cloud has the maximum.
-        base: [d, c], what is added to it.
-    """
+    """The gradient of W, added to `base` [d, c]; `where` [b, d] are the points of the maxima."""
     if kernels := triton_kernels(_TRITON, x):
         return kernels.weight_gradient(grad, x, where, base)
     rows = x.gather(1, where[:, :, None].expand(-1, -1, x.shape[2]))  # [b, d, c]
@@ -77,9 +74,19 @@ weight_gradient.register_fake(lambda grad, x, where, base: torch.empty_like(base
 
 
 class _Pooled(torch.autograd.Function):
+    """Its gradient needs no [B, N, D]: the maximum's is one row of x and of weight per channel."""
+
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
-        most, where = (x @ weight.T).max(1)
+        if fast.on_cpu(x):
+            (b, n, _), d = x.shape, len(weight)
+            most, where = x.new_empty(b, d), torch.empty(b, d, dtype=torch.int64)
+            step = max(1, _AT_ONCE // (n * d))
+            for i in range(0, b, step):
+                y = matmul_t(x[i : i + step], weight)  # [step, n, d]
+                most[i : i + step], where[i : i + step] = max_over_rows(y)
+        else:
+            most, where = (x @ weight.T).max(1)
         centre = x.mean(1)  # [b, c]
         ctx.save_for_backward(x, weight, where, centre)
         return torch.cat([most, centre @ weight.T], dim=1)
@@ -89,16 +96,19 @@ class _Pooled(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
         x, weight, where, centre = ctx.saved_tensors
         grad = grad.to(x.dtype).contiguous()
-        mean = grad[:, len(weight) :]
+        most, mean = grad.chunk(2, dim=1)  # [b, d] each
+        if fast.on_cpu(x):
+            found = compiled.linear_max_backward(x, weight, most, where)
+            dx = (mean @ weight / x.shape[1])[:, None].expand_as(x).contiguous()
+            return dx.add_(found[0]), (mean.T @ centre).add_(found[1])
         first, order = lists_of(where, x.shape[1])
-        # The kernels themselves save an operation's own way; a compiler's graph has operations.
-        at = (not torch.compiler.is_compiling() and triton_kernels(_TRITON, x)) or sys.modules[
-            __name__
-        ]
+        at = implementation(__name__, _TRITON, x)
         dx = at.points_gradient(grad, weight, mean @ weight, first, order)
         return dx, at.weight_gradient(grad, x, where, mean.T @ centre)
 
 
-def pooled(x: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]) -> Float[Tensor, "b 2*d"]:
+def pooled_linear(
+    x: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]
+) -> Float[Tensor, "b 2*d"]:
     """Maximum and mean over the points of a linear map without bias."""
     return _Pooled.apply(x.contiguous(), weight.contiguous())

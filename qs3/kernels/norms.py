@@ -53,10 +53,6 @@ class DomainNorm(nn.Module):
         """As the current domain's batch norm."""
         return self.current(x)
 
-    def extra_repr(self) -> str:
-        """Shown by print(model)."""
-        return f"domain={self.domain}"
-
 
 def make_norm(kind: Norm, channels: int, *, images: bool = False) -> nn.Module:
     """The norm of that name for [R, C] (not "instance") or [B, C, N], or for `images` [B, C, H, W].
@@ -108,10 +104,7 @@ def uses_batch(norm: nn.Module) -> bool:
 def track(norm: nn.Module, mean: Tensor, var: Tensor, count: int) -> None:
     """Update running statistics as `nn.BatchNorm1d` does; nothing if the norm keeps none.
 
-    Args:
-        norm: as from `make_norm`.
-        mean, var: [C] of this batch, `var` biased.
-        count: values behind them.
+    By mean and biased variance [C] of a batch of `count` values.
     """
     norm = active(norm)
     if not norm.training or norm.running_mean is None or norm.running_var is None:
@@ -152,9 +145,8 @@ def use_trained(net: nn.Module, domain: str) -> Iterator[None]:
     """As `use_domain`, for clouds of `domain` in evaluation: each layer by a norm that was trained.
 
     That of `domain`, or the other one where that never saw a cloud; the source's if neither did.
-    So a net that has only seen the source serves the target with the source's norms, a student
-    that has only seen the target the source with the target's, and a net whose backbone alone has
-    seen the target serves it with the backbone's norms of the target and the head's of the source.
+    So a net whose backbone alone has seen the target serves it with the backbone's norms of the
+    target and the head's of the source.
     """
     assert domain in DOMAINS, domain
     with _using({norm: _trained(norm, domain) for norm in _domain_norms(net)}):
@@ -189,8 +181,8 @@ def begin_target_norms(net: nn.Module) -> None:
     """Give target norms that were never trained the source's weights and statistics.
 
     A student that goes on with a teacher which never saw the target would otherwise leave it in
-    its first step: the teacher spoke with the source's norms (`use_trained`). They count as never
-    trained until a pass: one may not follow, and the source's change.
+    its first step, as the teacher used the source's norms. They count as never trained until a
+    pass.
     """
     for norm in _domain_norms(net):
         if not norm.target.num_batches_tracked:
@@ -233,8 +225,7 @@ def adapt_batchnorm(
     """AdaBN: give every batch norm the statistics of these clouds (Li et al., 2016, alg. 1).
 
     No weight changes. One pass, in which a layer's input was normalised with the statistics of its
-    own batch. Means and variances are pooled over all batches: neither the order of the batches nor
-    a smaller last one matters, and of the former statistics no more is left than `kept` says.
+    own batch; means and variances are pooled over all batches.
 
     Args:
         net: takes a batch of clouds. Of domain-specific norms those of the current domain are
@@ -242,8 +233,7 @@ def adapt_batchnorm(
         batches: of clouds [B, N, 3], of at least two each.
         kept: in [0, 1], the share of the former means and variances in what the norms then hold
             (alpha-BN: You et al., "Test-time Batch Statistics Calibration for Covariate Shift",
-            arXiv 2110.04065, 2021; there a batch goes on normalised by the mix, here by its own
-            statistics).
+            arXiv 2110.04065, 2021; there a batch goes on normalised by the mix).
 
     Returns:
         The adapted norms.
@@ -253,27 +243,40 @@ def adapt_batchnorm(
     """
     check_has_norms(net, "adabn")
     norms = running_norms(net)
+    pooled = [_Pooled(norm) for norm in norms]
+
+    def count(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        _LAST_COUNT[norm] = inputs[0].numel() // inputs[0].shape[1]
+
+    hooks = [norm.register_forward_pre_hook(count) for norm in norms]
     modes = {module: module.training for module in net.modules()}
     momenta = [norm.momentum for norm in norms]
     try:
         net.eval()  # no dropout, and nothing else that is left to chance
         for norm in norms:
             norm.training, norm.momentum = True, 1.0
-        _estimate(net, norms, batches, kept)
+        for points in batches:
+            for norm in norms:
+                _LAST_COUNT.pop(norm, None)
+            net(points)
+            for norm, pool in zip(norms, pooled, strict=True):
+                assert norm in _LAST_COUNT, "a layer that does not call its norm must use `track`"
+                pool.add(_LAST_COUNT[norm])
     finally:
+        for hook in hooks:
+            hook.remove()
         for norm, momentum in zip(norms, momenta, strict=True):
             norm.momentum = momentum
         for module, mode in modes.items():
             module.training = mode
+    assert pooled[0].total, "no batches to take statistics of"
+    for pool in pooled:
+        pool.store(kept)
     return list(norms)
 
 
 def check_has_norms(net: nn.Module, what: str) -> None:
-    """Refuse a net without batch norm, of which there is nothing to adapt.
-
-    Raises:
-        ConfigError: `evaluation.norms` is `what`, and the net has no running statistics.
-    """
+    """Raise ConfigError for a net without running statistics, of which nothing can adapt."""
     if not running_norms(net):
         raise ConfigError(f"evaluation.norms={what} adapts batch norms, and this net has none")
 
@@ -287,30 +290,3 @@ def running_norms(net: nn.Module) -> list[_BatchNorm]:
     }
     found = [m for m in net.modules() if isinstance(m, _BatchNorm) and m.running_mean is not None]
     return [norm for norm in found if norm not in asleep]
-
-
-def _estimate(
-    net: nn.Module, norms: list[_BatchNorm], batches: Iterable[Tensor], kept: float
-) -> None:
-    pooled = [_Pooled(norm) for norm in norms]
-
-    def count(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
-        _LAST_COUNT[norm] = inputs[0].numel() // inputs[0].shape[1]
-
-    hooks = [norm.register_forward_pre_hook(count) for norm in norms]
-    seen = 0
-    try:
-        for points in batches:
-            for norm in norms:
-                _LAST_COUNT.pop(norm, None)
-            net(points)
-            seen += 1
-            for norm, pool in zip(norms, pooled, strict=True):
-                assert norm in _LAST_COUNT, "a layer that does not call its norm must use `track`"
-                pool.add(_LAST_COUNT[norm])
-    finally:
-        for hook in hooks:
-            hook.remove()
-    assert seen, "no batches to take statistics of"
-    for pool in pooled:
-        pool.store(kept)

@@ -73,12 +73,8 @@ def kth_smallest(bits: Any, limits: Any, bound: Any, begin: int, end: int) -> No
     """The k-th smallest number of each row, by halving the range that it lies in; NaN is above all.
 
     As whole numbers the bits of floats have their order once those of negative ones are turned.
-    Counting how many are at most so large is done in vectors; sorting well so takes AVX-512.
-
-    Args:
-        bits: [r, n] int32 or int64, those of float32 or float64.
-        limits: [3] of that type: its largest number, the bits of infinity, and k.
-        bound: [r] likewise, gets the bits of what is found.
+    `bits` [r, n] are those of float32 or float64, as `bound` [r] of what is found; `limits` [3] are
+    the type's largest number, the bits of infinity, and k.
     """
     kind = bits.dtype.type  # each result is cast: else numbers, and with them vectors, are of int64
     top, infinite, k = limits[0], limits[1], limits[2]
@@ -114,8 +110,8 @@ def collect_below(
 ) -> None:
     """Values up to a row's bound and their columns, in order; the places behind them get inf.
 
-    `few` and `column` have as many places as may be in, and a turn more to be written to. A count
-    that is greater says that they were too few.
+    `few` and `column` have as many places as may be in, and a turn more; a greater count says that
+    they were too few.
     """
     groups, turns = minima.shape[1], values.shape[1] // minima.shape[1]
     places = few.shape[1] - groups
@@ -151,8 +147,8 @@ def collect_below(
 def take_in_order(few: Any, column: Any, count: Any, out: Any, begin: int, end: int) -> None:
     """Columns of the smallest of count[i] values, smallest first, and of equal ones the first.
 
-    Of fewer than there are places for what follows them is taken, too. None is NaN. A value's place
-    is how many are below it: of a few all comparisons take less time than a sort.
+    None is NaN. A value's place is how many are below it: of a few all comparisons take less time
+    than a sort.
     """
     k = out.shape[1]
     a_few = 4 * k

@@ -13,7 +13,7 @@ from typing import Any, no_type_check
 import torch
 from torch import Tensor
 
-from qs3.kernels.device import takes_triton
+from qs3.kernels.device import triton_kernels
 
 _MOST_POINTS = 1 << 14  # of a cloud that a thread block can hold
 _MOST_VALUES = 1 << 12  # of a row that a warp or a few can hold
@@ -21,20 +21,12 @@ _MOST_VALUES = 1 << 12  # of a row that a warp or a few can hold
 
 @torch.library.custom_op("qs3::farthest_points", mutates_args=())
 def farthest_points(x: Tensor, n: int, start: Tensor) -> Tensor:
-    """Order in which farthest point sampling takes points.
+    """Order [b, n] in which farthest point sampling takes n of N points, from start [b] on.
 
-    Args:
-        x: [b, N, 3] float32, about each cloud's mean.
-        n: how many, at most N.
-        start: [b] int64, the first ones.
-
-    Returns:
-        [b, n] int64.
+    x: [b, N, 3] float32, about each cloud's mean.
     """
-    if x.is_cuda and x.shape[1] <= _MOST_POINTS and takes_triton(x):
-        from qs3.kernels import triton_points
-
-        return triton_points.farthest_points(x, n, start)
+    if x.shape[1] <= _MOST_POINTS and (kernels := triton_kernels("triton_points", x)):
+        return kernels.farthest_points(x, n, start)
     out = torch.empty(len(x), n, dtype=torch.int64, device=x.device)
     state = _begin(x, start)
     for i in range(n):
@@ -75,30 +67,15 @@ def _step(x, state):
 
 @torch.library.custom_op("qs3::smallest_of_rows", mutates_args=())
 def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
-    """Columns of the k smallest values of each row after `more` is added to them, smallest first.
+    """Columns [b, r, k] of the k smallest of values [b, r, n] after `more` [b, n] is added.
 
-    `qs3.kernels.compiled.smallest_sums` is the CPU's. Of equal values any comes first; NaN last.
-
-    Args:
-        values: [b, r, n].
-        more: [b, n], of each of the r rows.
-        k: at most `n`.
-
-    Returns:
-        int64 [b, r, k].
+    Smallest first; of equal values any comes first, NaN last. `compiled` has the CPU's.
     """
-    if values.is_cuda and takes_triton(values) and _fits(values):
-        from qs3.kernels import triton_points
-
-        return triton_points.smallest_sums(values, more, k)
+    if values.shape[-1] <= _MOST_VALUES and (kernels := triton_kernels("triton_points", values)):
+        return kernels.smallest_sums(values, more, k)
     return (values + more[:, None]).topk(k, largest=False)[1]
 
 
 smallest_sums.register_fake(
     lambda values, more, k: values.new_empty(*values.shape[:2], k, dtype=torch.int64)
 )
-
-
-def _fits(values: Tensor) -> bool:
-    """Whether the kernel is made for rows such as these, [..., n]."""
-    return values.dtype == torch.float32 and values.shape[-1] <= _MOST_VALUES

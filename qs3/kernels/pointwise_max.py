@@ -21,7 +21,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3 import kernels as fast
-from qs3.kernels import compiled, linear_max
+from qs3.kernels import compiled
 from qs3.kernels.device import exporting
 from qs3.kernels.matmul import matmul_t
 from qs3.kernels.norms import active, statistics, uses_batch
@@ -115,14 +115,8 @@ class _Largest(torch.autograd.Function):
             dweight += torch.outer(dmean, centre)
         else:
             dy, dweight = torch.zeros_like(rows), torch.zeros_like(weight)
-        if compiled.usable(rows):
-            found = compiled.linear_max_backward(rows.view(b, n, c), weight, dbest, where)
-            return dy.view(b, n, c).add_(found[0]), dweight.add_(found[1]), None
-        for i in range(b):  # D has one entry a cloud and channel
-            at, grad = where[i] + i * n, dbest[i, :, None]
-            dy.index_add_(0, at, grad * weight)
-            dweight += grad * rows.index_select(0, at)
-        return dy.view(b, n, c), dweight, None
+        found = compiled.linear_max_backward(rows.view(b, n, c), weight, dbest, where)
+        return dy.view(b, n, c).add_(found[0]), dweight.add_(found[1]), None
 
 
 def normed_maximum(
@@ -141,44 +135,3 @@ def normed_maximum(
         best, mean = best + layer.bias, mean + layer.bias
     mean, var = statistics(plain, mean, var, y.shape[0] * y.shape[1])
     return (best - mean) * (gamma * torch.rsqrt(var + plain.eps)) + plain.bias
-
-
-class _PooledLinear(torch.autograd.Function):
-    """Its gradient needs no [B, N, D]: the maximum's is one row of x and of weight per channel."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
-        b, n, _ = x.shape
-        d = weight.shape[0]
-        out = x.new_empty(b, 2 * d)
-        where = torch.empty(b, d, dtype=torch.int64, device=x.device)
-        step = max(1, (1 << 22) // (n * d))  # 16 MB of float32
-        for i in range(0, b, step):
-            y = matmul_t(x[i : i + step], weight)  # [step, n, d]
-            out[i : i + step, :d], where[i : i + step] = max_over_rows(y)
-        centre = x.mean(1)  # [b, c]
-        torch.mm(centre, weight.T, out=out[:, d:])
-        ctx.save_for_backward(x, weight, where, centre)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
-        x, weight, where, centre = ctx.saved_tensors
-        most, mean = grad.chunk(2, dim=1)  # [b, d] each
-        dx = (mean @ weight / x.shape[1])[:, None].expand_as(x).contiguous()
-        dweight = mean.T @ centre
-        if compiled.usable(x):
-            found = compiled.linear_max_backward(x, weight, most, where)
-            return dx.add_(found[0]), dweight.add_(found[1])
-        for x_i, dx_i, most_i, where_i in zip(x, dx, most[:, :, None], where, strict=True):
-            dx_i.index_add_(0, where_i, most_i * weight)
-            dweight.addcmul_(most_i, x_i.index_select(0, where_i))
-        return dx, dweight
-
-
-def pooled_linear(
-    x: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]
-) -> Float[Tensor, "b 2*d"]:
-    """Maximum and mean over the points of a linear map without bias."""
-    return _PooledLinear.apply(x, weight) if fast.on_cpu(x) else linear_max.pooled(x, weight)

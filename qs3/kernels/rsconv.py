@@ -18,8 +18,7 @@ tensors [B, M, K, C]. Here, with the same sums:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -32,36 +31,21 @@ _AT_ONCE = 1 << 18  # values of p worked on at once: 1 MB in float32
 _STEP = 4  # sizes of balls are rounded up to multiples of it
 
 
-@dataclass(frozen=True)
-class Balls:
-    """Balls of nearly one size.
+class Balls(NamedTuple):
+    """Balls of nearly one size."""
 
-    Attributes:
-        which: [g] int64, rows among all balls.
-        index: [g, k] int64, rows of the members among the points of all clouds.
-        u: [g, k, 8] |d|, s (3), d (3), 1 of each member, d from the centre to it.
-        weight: [g, k] slots that hold this member; 0 for a copy that fills up the row.
-    """
-
-    which: Tensor
-    index: Tensor
-    u: Tensor
-    weight: Tensor
+    which: Tensor  # [g] int64, rows among all balls
+    members: Tensor  # [g, k] int64, their rows among the points of all clouds
+    u: Tensor  # [g, k, 8] |d|, s (3), d (3), 1 of each member, d from the centre to it
+    weight: Tensor  # [g, k] slots that hold this member; 0 for a copy that fills up the row
 
 
-@dataclass(frozen=True)
-class Relations:
-    """All balls of a batch.
+class Relations(NamedTuple):
+    """All balls of a batch."""
 
-    Attributes:
-        balls: by size; each ball is in one of them.
-        count: how many balls there are.
-        slots: how many slots they have as published, copies included.
-    """
-
-    balls: tuple[Balls, ...]
-    count: int
-    slots: int
+    balls: tuple[Balls, ...]  # by size; each ball is in one of them
+    number: int  # of balls
+    slots: int  # that they have as published, copies included
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Mean [8] and covariance [8, 8] of u over all slots, float64."""
@@ -78,11 +62,9 @@ class Relations:
 def relations(points: Tensor, centres: Tensor, index: Tensor, relation: str) -> Relations:
     """Put balls together by size and describe their members.
 
-    Args:
-        points: [B, N, 3].
-        centres: [B, M, 3].
-        index: [B, M, K] int64, a ball's distinct members first, then copies of the first.
-        relation: what s is: "released": d of the first member; "paper": the centre; "original": 0.
+    Of points [B, N, 3], centres [B, M, 3], and index [B, M, K] int64, a ball's distinct members
+    first, then copies of the first. s is by `relation` "released" d of the first member, by "paper"
+    the centre, by "original" 0.
     """
     b, n, _ = points.shape
     m, k = index.shape[1:]
@@ -123,7 +105,7 @@ class _LargestProduct(torch.autograd.Function):
         bias: Tensor,
         statistics: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        best = mapping.new_empty(relations.count, len(weight))
+        best = mapping.new_empty(relations.number, len(weight))
         where = torch.empty(best.shape, dtype=torch.int64, device=best.device)
         moments = _Moments(weight)
         for part in _parts(relations, len(weight)):
@@ -159,7 +141,7 @@ class _LargestProduct(torch.autograd.Function):
             if draising is not None:
                 draising.addmm_(relu_gradient(dx, x).T, u)
             elif dfeatures is not None:
-                dfeatures.index_add_(0, part.index.flatten(), dx[:, 3:].contiguous())
+                dfeatures.index_add_(0, part.members.flatten(), dx[:, 3:].contiguous())
             dw = dp.mul_(x)
             dweight.addmm_(dw.T, a)
             dbias += dw.sum(0)
@@ -183,17 +165,16 @@ def _products(
         x = (u @ raising.T).relu_()
     else:
         assert features is not None
-        x = torch.cat([u[:, 4:7], features.index_select(0, part.index.flatten())], dim=1)
-    return a, w, x, (w * x).view(*part.index.shape, -1)
+        x = torch.cat([u[:, 4:7], features.index_select(0, part.members.flatten())], dim=1)
+    return a, w, x, (w * x).view(*part.members.shape, -1)
 
 
 def _parts(relations: Relations, channels: int) -> Iterator[Balls]:
     """Some balls at a time."""
     for balls in relations.balls:
-        step = max(1, _AT_ONCE // (balls.index.shape[1] * channels))
+        step = max(1, _AT_ONCE // (balls.members.shape[1] * channels))
         for i in range(0, len(balls.which), step):
-            part = slice(i, i + step)
-            yield Balls(balls.which[part], balls.index[part], balls.u[part], balls.weight[part])
+            yield Balls(*(values[i : i + step] for values in balls))
 
 
 class _Moments:
@@ -231,13 +212,9 @@ def rs_conv(
 ) -> Tensor:
     """max_j relu(norm(M(h_ij) * x_ij)) of each ball: [count, C].
 
-    Args:
-        relations: the balls of all clouds.
-        features: [P, C'] of the points of all clouds; None if `raising` makes x of d.
-        relation: of `relations`.
-        mapping, weighing: M is `weighing` of relu of `mapping`, a layer and its norm.
-        raising: x is relu of this layer and norm, or (d, features) if None.
-        norm: of the products. With instance norms give one cloud at a time.
+    M is `weighing` of relu of `mapping`, a layer and its norm; x is relu of `raising`, likewise, or
+    (d, features) if None, with features [P, C'] of the points of all clouds. `norm` is that of the
+    products. With instance norms give one cloud at a time.
     """
     moments = relations.moments()
     slots = relations.slots

@@ -67,12 +67,11 @@ def edge_extremes(pr, index, gamma, pivot):
     best, sums, own = pr.new_empty(3, rows, d).unbind(0)
     taken = torch.empty(rows, d, dtype=torch.uint8, device=pr.device)
     parts = pr.new_empty(2, blocks, d)
-    grid = (blocks, triton.cdiv(d, _FEW_CHANNELS))
-    settings = {"ROWS": ROWS, "CHANNELS": _FEW_CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(pr):
-        _extremes[grid](
-            pr, index, gamma, pivot, best, taken, sums, own, parts, rows, d, k, **settings
-        )
+        _extremes[blocks, triton.cdiv(d, _FEW_CHANNELS)](
+            pr, index, gamma, pivot, best, taken, sums, own, parts, rows, d, k,
+            ROWS=ROWS, CHANNELS=_FEW_CHANNELS, num_warps=4,
+        )  # fmt: skip
     return best, taken, sums, own, parts
 
 
@@ -114,12 +113,10 @@ def edge_output(best, sums, pivot, gamma, beta, edges, eps, negative_slope):
     rows, d = best.shape
     y, t = best.new_empty(2, rows, d).unbind(0)
     constants = best.new_empty(5, d)
-    grid = (triton.cdiv(rows, ROWS), triton.cdiv(d, _CHANNELS))
-    settings = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(best):
-        _output[grid](
+        _output[triton.cdiv(rows, ROWS), triton.cdiv(d, _CHANNELS)](
             best, sums, pivot, gamma, beta, y, t, constants, rows, d, edges, eps, negative_slope,
-            **settings,
+            ROWS=ROWS, CHANNELS=_CHANNELS, num_warps=4,
         )  # fmt: skip
     return y, t, constants
 
@@ -152,12 +149,11 @@ def edge_output_gradient(grad, y, t, constants, negative_slope):
     rows, d = y.shape
     blocks = triton.cdiv(rows, ROWS)
     du, parts = torch.empty_like(y), y.new_empty(2, blocks, d)
-    grid = (blocks, triton.cdiv(d, _CHANNELS))
-    settings = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(y):
-        _output_gradient[grid](
-            grad, y, t, constants, du, parts, rows, d, negative_slope, **settings
-        )
+        _output_gradient[blocks, triton.cdiv(d, _CHANNELS)](
+            grad, y, t, constants, du, parts, rows, d, negative_slope,
+            ROWS=ROWS, CHANNELS=_CHANNELS, num_warps=4,
+        )  # fmt: skip
     return du, parts
 
 
@@ -210,11 +206,9 @@ def edge_gradient(pr, own, du, taken, sums, first, order, constants, of_norm):
     """The gradient of P and R."""
     rows, d = du.shape
     out = torch.empty_like(pr)
-    grid = (rows, triton.cdiv(d, _CHANNELS))
-    settings = {"EDGES": _EDGES, "CHANNELS": _CHANNELS, "num_warps": 1}
     with torch.cuda.device_of(pr):
-        _gradient[grid](
+        _gradient[rows, triton.cdiv(d, _CHANNELS)](
             pr, own, du, taken, sums, first, order, constants, of_norm, out,
-            d, len(order) // rows, len(order), **settings,
+            d, len(order) // rows, len(order), EDGES=_EDGES, CHANNELS=_CHANNELS, num_warps=1,
         )  # fmt: skip
     return out

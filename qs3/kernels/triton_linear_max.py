@@ -44,10 +44,10 @@ def points_gradient(grad, weight, beside, first, order):
     (d, c), (b, wide), n = weight.shape, grad.shape, first.shape[1] - 1
     out = weight.new_empty(b, n, c)
     channels = min(_OF_A_POINT, triton.next_power_of_2(c))
-    grid = (b * n, triton.cdiv(c, channels))
-    settings = {"CHANNELS": channels, "num_warps": 1}
     with torch.cuda.device_of(weight):
-        _points[grid](grad, weight, beside, first, order, out, n, c, d, wide, **settings)
+        _points[b * n, triton.cdiv(c, channels)](
+            grad, weight, beside, first, order, out, n, c, d, wide, CHANNELS=channels, num_warps=1
+        )
     return out
 
 
@@ -77,8 +77,9 @@ def weight_gradient(grad, x, where, base):
     """The gradient of W."""
     (b, n, c), d = x.shape, len(base)
     out = torch.empty_like(base)
-    grid = (triton.cdiv(d, ROWS), triton.cdiv(c, _CHANNELS))
-    settings = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(x):
-        _weights[grid](grad, x, where, base, out, b, n, c, d, grad.shape[1], **settings)
+        _weights[triton.cdiv(d, ROWS), triton.cdiv(c, _CHANNELS)](
+            grad, x, where, base, out, b, n, c, d, grad.shape[1],
+            ROWS=ROWS, CHANNELS=_CHANNELS, num_warps=4,
+        )  # fmt: skip
     return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
@@ -40,13 +40,11 @@ def farthest_points(x: Tensor, n: int, start: Tensor) -> Tensor:
     b, total, _ = x.shape
     out = torch.empty(b, n, dtype=torch.int64, device=x.device)
     block = triton.next_power_of_2(total)
-    settings: dict[str, Any] = {
-        "BLOCK": block,
-        "num_warps": max(1, min(16, block // 256)),
-        "enable_fp_fusion": False,  # the rounding of the steps, so that ties fall alike
-    }
-    with torch.cuda.device_of(x):
-        _farthest[(b,)](x.contiguous(), start.contiguous(), out, total, n, **settings)
+    with torch.cuda.device_of(x):  # without fusion: the rounding of the steps, so ties fall alike
+        _farthest[(b,)](
+            x.contiguous(), start.contiguous(), out, total, n,
+            BLOCK=block, num_warps=max(1, min(16, block // 256)), enable_fp_fusion=False,
+        )  # fmt: skip
     return out
 
 
@@ -106,8 +104,9 @@ def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     block = triton.next_power_of_2(n)
     bounded = k <= 32 and n >= 128  # then each group has a column
     few = out.new_empty(b * r if bounded else 1, _FEW, dtype=torch.int32)
-    settings: dict[str, Any] = {"BLOCK": block, "BOUNDED": bounded, "FEW": _FEW}
-    settings["num_warps"] = max(1, block // 1024)
     with torch.cuda.device_of(values):
-        _smallest[(b * r,)](values.contiguous(), more.contiguous(), few, out, r, n, k, **settings)
+        _smallest[(b * r,)](
+            values.contiguous(), more.contiguous(), few, out, r, n, k,
+            BLOCK=block, BOUNDED=bounded, FEW=_FEW, num_warps=max(1, block // 1024),
+        )  # fmt: skip
     return out

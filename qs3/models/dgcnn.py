@@ -23,9 +23,10 @@ from qs3 import kernels as fast
 from qs3.geometry.neighbours import gather, knn
 from qs3.kernels.device import exact_products, takes_triton
 from qs3.kernels.edgeconv import edge_conv
+from qs3.kernels.linear_max import pooled_linear
 from qs3.kernels.matmul import linear
 from qs3.kernels.norms import Norm, head_norm, make_norm, normed, uses_batch
-from qs3.kernels.pointwise_max import max_over_members, max_over_rows, pooled_linear
+from qs3.kernels.pointwise_max import max_over_members, max_over_rows
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.utils.settings import checked
 
@@ -68,10 +69,6 @@ class EdgeConv(nn.Module):
                 return edge_conv(x, index, weight, self.norm, self.negative_slope)
             z = normed(self.norm, self.linear(edges_of(x, index)))  # [b, n, k, d]
             return max_over_members(F.leaky_relu(z, self.negative_slope))
-
-    def extra_repr(self) -> str:
-        """Shown by print(model)."""
-        return f"negative_slope={self.negative_slope}"
 
 
 def edges_of(x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n k 2*c"]:

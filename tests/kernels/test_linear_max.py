@@ -23,8 +23,8 @@ def test_values_and_gradients_are_those_of_the_layer() -> None:
     x, weight = (t.requires_grad_() for t in _inputs(3, 7, 4, 5, torch.float64))
     y = x @ weight.T
     expected = torch.cat([y.amax(1), y.mean(1)], 1)
-    torch.testing.assert_close(linear_max.pooled(x, weight), expected)
-    assert torch.autograd.gradcheck(linear_max.pooled, (x, weight))
+    torch.testing.assert_close(linear_max.pooled_linear(x, weight), expected)
+    assert torch.autograd.gradcheck(linear_max.pooled_linear, (x, weight))
 
 
 @pytest.mark.parametrize("rows", [5, 1 << 15, (1 << 16) - 1, 1 << 16])
@@ -78,7 +78,7 @@ def test_on_a_gpu(n: int, d: int) -> None:
     found = []
     for _ in range(2):
         leaves = [x.clone().requires_grad_(), weight.clone().requires_grad_()]
-        out = linear_max.pooled(*leaves)
+        out = linear_max.pooled_linear(*leaves)
         (out * scale).sum().backward()
         found.append([out.detach(), *(leaf.grad for leaf in leaves)])
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
