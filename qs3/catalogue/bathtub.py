@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from qs3.catalogue import parts as p
-from qs3.catalogue.furniture import Draw, families_of
+from qs3.catalogue.furniture import CORNERS, Draw, families_of
 from qs3.meshes.mesh import Mesh
 
 Outline = Callable[[float, float], np.ndarray]
@@ -133,13 +133,12 @@ def bowl(draw: Draw, size: tuple[float, float], lift: float, top: float, shift: 
 def claw_feet(draw: Draw, width: float, depth: float, lift: float) -> list[Mesh]:
     """Four claw feet: a knee under the tub, an ankle, a ball on the floor."""
     parts, ball = [], draw.between(0.05, 0.075)
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            x, y = sx * 0.29 * width, sy * 0.27 * depth
-            foot = (x + 0.03 * sx, y + 0.06 * sy, ball / 2)
-            leg = p.arc((x, y, lift + 0.09), (x + 0.05 * sx, y + 0.09 * sy, lift), foot, 6)
-            parts.append(p.tube(leg, 0.03, scale=np.linspace(1.5, 0.7, 7)))
-            parts.append(p.ellipsoid((1.1 * ball, 1.2 * ball, ball), foot, sides=12, rings=7))
+    for sx, sy in CORNERS:
+        x, y = sx * 0.29 * width, sy * 0.27 * depth
+        foot = (x + 0.03 * sx, y + 0.06 * sy, ball / 2)
+        leg = p.arc((x, y, lift + 0.09), (x + 0.05 * sx, y + 0.09 * sy, lift), foot, 6)
+        parts.append(p.tube(leg, 0.03, scale=np.linspace(1.5, 0.7, 7)))
+        parts.append(p.ellipsoid((1.1 * ball, 1.2 * ball, ball), foot, sides=12, rings=7))
     return parts
 
 

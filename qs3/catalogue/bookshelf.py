@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from qs3.catalogue import parts as p
-from qs3.catalogue.case import Case, build, families_of_cases
 from qs3.catalogue.furniture import Draw, families_of
-from qs3.catalogue.joinery import contents
+from qs3.catalogue.joinery import Case, build, contents, families_of_cases
 from qs3.meshes.mesh import Mesh
 
 TRAIN = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from qs3.catalogue import parts as p
-from qs3.catalogue.case import WHOLE, Case, build, families_of_cases, stacked
 from qs3.catalogue.furniture import Draw, families_of
+from qs3.catalogue.joinery import WHOLE, Case, build, families_of_cases, stacked
 from qs3.meshes.mesh import Mesh
 
 TRAIN = {

@@ -13,6 +13,7 @@ from qs3.catalogue import parts as p
 from qs3.meshes.mesh import Mesh
 
 T = TypeVar("T")
+CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
 
 
 class Draw:
@@ -48,17 +49,11 @@ Build = Callable[[Draw], list[Mesh]]
 
 @dataclass(frozen=True)
 class Family:
-    """Objects of one construction, e.g. chairs on a swivel base.
+    """Objects of one construction, e.g. chairs on a swivel base."""
 
-    Attributes:
-        name: unique within its class.
-        split: the only split that draws from it.
-        build: makes the parts of one object, front along -y.
-    """
-
-    name: str
-    split: str
-    build: Build
+    name: str  # unique within its class
+    split: str  # the only one that draws from it
+    build: Build  # makes the parts of one object, front along -y
 
 
 def families_of(train: tuple[Build, ...], test: tuple[Build, ...]) -> tuple[Family, ...]:
@@ -100,11 +95,10 @@ def four_legs(
     stands out by `splay` along x and along y.
     """
     legs = []
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            top = np.array([sx * width / 2, sy * depth / 2, height])
-            out = np.array([sx * splay, sy * splay, -height])
-            legs.append(post([top + out, top], section, [foot, 1.0]))
+    for sx, sy in CORNERS:
+        top = np.array([sx * width / 2, sy * depth / 2, height])
+        out = np.array([sx * splay, sy * splay, -height])
+        legs.append(post([top + out, top], section, [foot, 1.0]))
     return legs
 
 
@@ -142,12 +136,7 @@ def curved_panel(
 
 
 def back_cushion(
-    size: p.Vector,
-    at: p.Vector,
-    *,
-    rake: float = 10.0,
-    crown: float = 0.03,
-    radius: float = 0.04,
+    size: p.Vector, at: p.Vector, *, rake: float = 10.0, crown: float = 0.03, radius: float = 0.04
 ) -> Mesh:
     """A filled cushion of (width, thickness, height) leaning back, its crown to the front.
 

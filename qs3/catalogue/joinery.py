@@ -1,32 +1,38 @@
-"""Boards, fronts, feet and what stands on shelves: the parts of cabinets and bookshelves."""
+"""Cases of bays, declared as data, and their boards, fronts, feet and contents.
+
+Most cabinets and bookshelves are made of them.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from qs3.catalogue import parts as p
-from qs3.catalogue.furniture import Draw
+from qs3.catalogue.furniture import CORNERS, Draw, Family
 from qs3.meshes.mesh import Mesh
 
 FRONT_M = 0.02  # thickness of doors and drawer fronts
 GAP_M = 0.004  # between neighbouring fronts
 
 
+Range = tuple[float, float]
+Row = tuple[str, float, Range]
+"""What fills a share of a bay's height: its kind, the share, the height of one such front or
+compartment in metres. Kinds: "drawer", "door", "open" (shelves), "glass" (shelves behind a door).
+"""
+WHOLE = (9.0, 9.0)  # one door over the whole share
+
+
 @dataclass(frozen=True)
 class Look:
-    """What all fronts of one piece have in common.
+    """What all fronts of one piece have in common."""
 
-    Attributes:
-        front: "flat", "framed", "raised" or "glass".
-        grip: "knob", "bar" or "none".
-        scale: size of the grips, about 1.
-    """
-
-    front: str
-    grip: str
-    scale: float = 1.0
+    front: str  # "flat", "framed", "raised" or "glass"
+    grip: str  # "knob", "bar" or "none"
+    scale: float = 1.0  # of the grips
 
 
 def any_look(draw: Draw, *fronts: str) -> Look:
@@ -124,8 +130,8 @@ def drawer(
     if pulled > 0:
         w, h, middle = width - 0.03, 0.75 * height, y + depth / 2 - 0.015
         parts.append(p.box((w, depth - 0.03, 0.01), (x, middle, z + 0.02)))
-        for side in (x - (w / 2 - 0.006), x + (w / 2 - 0.006)):
-            parts.append(p.box((0.012, depth - 0.03, h), (side, middle, z + 0.02)))
+        sides = (x - (w / 2 - 0.006), x + (w / 2 - 0.006))
+        parts += [p.box((0.012, depth - 0.03, h), (side, middle, z + 0.02)) for side in sides]
         parts.append(p.box((w, 0.012, h), (x, y + depth - 0.036, z + 0.02)))
     return [p.move(part, (0, -pulled, 0)) for part in parts]
 
@@ -141,17 +147,16 @@ def feet(draw: Draw, width: float, depth: float, height: float, kind: str) -> li
     splay = draw.between(0.0, 0.35) * height
     bulge = [(0.5, 0), (0.9, 0.3), (1, 0.55), (0.75, 0.9), (0.6, 1)]
     parts = []
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            x, y = sx * (width / 2 - inset), sy * (depth / 2 - inset)
-            if kind == "square":
-                parts.append(p.box((thick, thick, height), (x, y, 0)))
-            elif kind == "bun":
-                profile = [(1.1 * thick * r, height * t) for r, t in bulge]
-                parts.append(p.lathe(profile, (x, y, 0), sides=12))
-            else:
-                foot, top, dx, dy = (0.5 * thick,) * 2, (thick,) * 2, splay * sx, 0.5 * splay * sy
-                parts.append(p.frustum(foot, top, height, (x + dx, y + dy, 0), (-dx, -dy)))
+    for sx, sy in CORNERS:
+        x, y = sx * (width / 2 - inset), sy * (depth / 2 - inset)
+        if kind == "square":
+            parts.append(p.box((thick, thick, height), (x, y, 0)))
+        elif kind == "bun":
+            profile = [(1.1 * thick * r, height * t) for r, t in bulge]
+            parts.append(p.lathe(profile, (x, y, 0), sides=12))
+        else:
+            foot, top, dx, dy = (0.5 * thick,) * 2, (thick,) * 2, splay * sx, 0.5 * splay * sy
+            parts.append(p.frustum(foot, top, height, (x + dx, y + dy, 0), (-dx, -dy)))
     return parts
 
 
@@ -204,3 +209,94 @@ def contents(
     wide = min(draw.between(0.4, 0.85) * width, 0.4)
     size = (wide, 0.8 * depth, min(draw.between(0.3, 0.75) * height, 0.25))
     return [p.box(size, (left + 0.5 * width, middle[1], z))]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Bays side by side, each filled from the bottom up. Lengths are ranges in metres."""
+
+    bay: Range  # width of a bay
+    bays: tuple[int, int]  # how many, at least and at most
+    depth: Range  # of the case without its fronts
+    height: Range  # of the case without its feet
+    lift: Range  # height of the feet; below 3 cm there are none
+    layouts: tuple[tuple[Row, ...], ...]  # a bay is one of these
+    alike: bool = False  # all bays are the same one
+    fronts: tuple[str, ...] = ("flat", "flat", "framed", "raised")  # see `Look`
+    feet: tuple[str, ...] = ("plinth", "square", "tapered", "bun")  # see `feet`
+    board: Range = (0.018, 0.022)  # thickness of the boards
+    back: float = 1.0  # probability of a back
+    fill: Range = (0.3, 0.9)  # how much of the open compartments holds something
+    top: bool = True  # a top plate lies on it, flush or overhanging
+
+
+def build(draw: Draw, case: Case, width: float = 0.0) -> list[Mesh]:
+    """One piece on the floor, its middle at the origin; `width` overrules that of the bays."""
+    bays = draw.count(*case.bays)
+    depth, height = draw.between(*case.depth), draw.between(*case.height)
+    width = width or bays * draw.between(*case.bay)
+    each, board, look = width / bays, draw.between(*case.board), any_look(draw, *case.fronts)
+    lift, fill = draw.between(*case.lift), draw.between(*case.fill)
+    parts = []
+    if lift > 0.03:
+        parts += feet(draw, width, depth, lift, draw.pick(*case.feet))
+    else:
+        lift = 0.0
+    parts += carcass((width, depth, height), (0, 0, lift), board, draw.chance(case.back))
+    layout = draw.pick(*case.layouts)
+    for k in range(bays):
+        x = each * (k + 0.5) - width / 2
+        if k:
+            parts.append(p.box((board, depth - 0.01, height - 0.01), (x - each / 2, 0.005, lift)))
+            layout = layout if case.alike else draw.pick(*case.layouts)
+        z = lift
+        for kind, share, one in layout:
+            count = max(1, round(share * height / draw.between(*one)))
+            tall = share * height / count
+            if z > lift:
+                parts.append(p.box((each, depth - 0.01, board), (x, 0.005, z)))
+            for row in range(count):
+                at, size = (x, -depth / 2, z + row * tall), (each, depth, tall)
+                if kind in ("open", "glass"):
+                    parts += _compartment(draw, size, at, board, fill, shelf=row > 0)
+                elif kind == "drawer":
+                    pulled = draw.between(0.1, 0.6) * depth if draw.chance(0.12) else 0.0
+                    parts += drawer(look, each, tall, depth, at, pulled)
+            if kind in ("door", "glass"):
+                hung = Look("glass", look.grip, look.scale) if kind == "glass" else look
+                pair = 2 if each > 0.6 else 1
+                for i in range(pair):
+                    at = (x + each * ((i + 0.5) / pair - 0.5), -depth / 2, z)
+                    angle = draw.between(20, 110) if draw.chance(0.15) else 0.0
+                    hinge = 1 if (i if pair > 1 else k % 2) else -1
+                    parts += door(hung, each / pair, share * height, at, hinge, angle)
+            z += share * height
+    if case.top:
+        out, thick = draw.pick(0.0, draw.between(0.01, 0.03)), draw.between(0.015, 0.035)
+        size = (width + 2 * out, depth + FRONT_M + out, thick)
+        parts.append(p.box(size, (0, -(FRONT_M + out) / 2, lift + height)))
+    return parts
+
+
+def _compartment(
+    draw: Draw, size: p.Vector, at: p.Vector, board: float, fill: float, *, shelf: bool
+) -> list[Mesh]:
+    """An open compartment of (width, depth, height) and what is in it; `at`: its front below."""
+    width, depth, height = (float(s) for s in size)
+    x, front, z = (float(c) for c in at)
+    parts = [p.box((width - board, depth - 0.02, board), (x, front + depth / 2 + 0.01, z))]
+    inner, room = width / 2 - board, (depth - 0.02, height - 2 * board)
+    filling = contents(draw, x - inner, x + inner, front + 0.01, z + board, room, fill)
+    return (parts if shelf else []) + filling
+
+
+def stacked(lower: list[Mesh], upper: list[Mesh], gap: float = 0.0) -> list[Mesh]:
+    """One piece on the other, or `gap` metres above it, their backs in one plane."""
+    rear = [max(float(part.bounds[1, 1]) for part in piece) for piece in (lower, upper)]
+    z = max(float(part.bounds[1, 2]) for part in lower) + gap
+    return lower + [p.move(part, (0, rear[0] - rear[1], z)) for part in upper]
+
+
+def families_of_cases(split: str, cases: dict[str, Case]) -> tuple[Family, ...]:
+    """A family for each declared case."""
+    return tuple(Family(name, split, partial(build, case=case)) for name, case in cases.items())

@@ -156,8 +156,7 @@ def pillow(size: Vector, at: Vector = ORIGIN) -> Mesh:
 
 def slab(curve: np.ndarray, height: float, at: Vector = ORIGIN) -> Mesh:
     """A level plate whose outline is a star-shaped plane curve (see `extrude` for upright ones)."""
-    rings = np.stack([ring_at(curve, 0.0), ring_at(curve, height)])
-    return loft(rings + np.asarray(at, dtype=np.float64))
+    return shell(curve, [(1, 0.0), (1, height)], at)
 
 
 def shell(curve: np.ndarray, profile: Sequence[tuple[float, float]], at: Vector = ORIGIN) -> Mesh:

@@ -26,11 +26,9 @@ def ball_query(
     centres: Float[Tensor, "b m 3"],
     radius: float,
     count: int,
-    *,
-    punctured: bool = False,
 ) -> Int[Tensor, "b m k"]:
     """Indices of the first `count` points of each ball; see `ball_queries`."""
-    return ball_queries(points, centres, [radius], [count], punctured=punctured)[0]
+    return ball_queries(points, centres, [radius], [count])[0]
 
 
 def ball_queries(
@@ -38,8 +36,6 @@ def ball_queries(
     centres: Float[Tensor, "b m 3"],
     radii: Sequence[float],
     counts: Sequence[int],
-    *,
-    punctured: bool = False,
 ) -> list[Int[Tensor, "b m k"]]:
     """Balls of several radii about the same centres; distances are computed once.
 
@@ -49,7 +45,6 @@ def ball_queries(
         centres: of the balls.
         radii: one a query, in the same unit, > 0.
         counts: indices in a ball of each query, >= 1.
-        punctured: points at distance 0 of a centre are not in its balls.
 
     Returns:
         For each query [B, M, count] int64. A ball without points holds the index of the point
@@ -61,7 +56,7 @@ def ball_queries(
         if exporting():  # blocks would bind the graph to a number of clouds
             squares = _squared_distances(points, centres)
             queries = zip(radii, counts, strict=True)
-            return [_first(_inside(squares, r, punctured), squares, k) for r, k in queries]
+            return [_first(squares < r * r, squares, k) for r, k in queries]
         b, n, _ = points.shape
         m = centres.shape[1]
         out = [torch.empty(b, m, k, dtype=torch.int64, device=points.device) for k in counts]
@@ -75,14 +70,9 @@ def ball_queries(
                 )
                 for index, radius, k in zip(out, radii, counts, strict=True):
                     first = _first_on_cpu if on_cpu else _first
-                    inside = _inside(squares, radius, punctured)
-                    index[i : i + clouds, j : j + rows] = first(inside, squares, k)
+                    found = first(squares < radius * radius, squares, k)
+                    index[i : i + clouds, j : j + rows] = found
         return out
-
-
-def _inside(squares: Tensor, radius: float, punctured: bool) -> Tensor:
-    inside = squares < radius * radius
-    return inside & (squares > 0) if punctured else inside
 
 
 def _squared_distances(points: Tensor, centres: Tensor) -> Tensor:

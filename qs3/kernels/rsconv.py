@@ -64,7 +64,7 @@ def relations(points: Tensor, centres: Tensor, index: Tensor, relation: str) -> 
 
     Of points [B, N, 3], centres [B, M, 3], and index [B, M, K] int64, a ball's distinct members
     first, then copies of the first. s is by `relation` "released" d of the first member, by "paper"
-    the centre, by "original" 0.
+    the centre.
     """
     b, n, _ = points.shape
     m, k = index.shape[1:]
@@ -78,9 +78,9 @@ def relations(points: Tensor, centres: Tensor, index: Tensor, relation: str) -> 
         which = (sizes == size).nonzero()[:, 0]
         members = flat[which, :size]
         d = xyz[members] - centres[which, None]  # [g, size, 3]
-        s = {"released": d[:, :1], "paper": centres[which, None], "original": torch.zeros_like(d)}
+        s = centres[which, None] if relation == "paper" else d[:, :1]
         ones = torch.ones_like(d[:, :, :1])
-        u = torch.cat([d.norm(dim=2, keepdim=True), s[relation].expand_as(d), d, ones], dim=2)
+        u = torch.cat([d.norm(dim=2, keepdim=True), s.expand_as(d), d, ones], dim=2)
         slot = torch.arange(size, device=points.device)
         weight = (slot < found[which, None]).to(u)
         weight[:, 0] += k - found[which]

@@ -32,17 +32,11 @@ _OF = 1024  # points of the clouds for which `min_points` are stated
 
 
 class Deformed(NamedTuple):
-    """Clouds with one voxel deformed.
-
-    Attributes:
-        points: [B, N, 3].
-        mask: [B, N] the points that were replaced; none where no voxel had enough points.
-        voxel: [B] the voxel, 0 to 26; meaningless where the mask is empty.
-    """
+    """Clouds with one voxel deformed."""
 
     points: Float[Tensor, "b n 3"]
-    mask: Bool[Tensor, "b n"]
-    voxel: Int[Tensor, " b"]
+    mask: Bool[Tensor, "b n"]  # points that were replaced; none where no voxel had enough points
+    voxel: Int[Tensor, " b"]  # 0 to 26; meaningless where the mask is empty
 
 
 def voxel_of(points: Float[Tensor, "b n 3"]) -> Int[Tensor, "b n"]:
@@ -171,9 +165,7 @@ class DefRec(Method):
     def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
         """Terms "ce" or "pcm", and "defrec" (and "defrec_source"), each >= 0."""
         source = batch["source"]
-        name, supervised = source_loss(
-            net, source, generator, pcm=self.pcm, smoothing=self.smoothing
-        )
+        name, supervised = source_loss(net, source, generator, self.smoothing, self.pcm)
         terms = {name: (1 - self.defrec_weight) * supervised}
         with use_domain(net, "target"):
             terms["defrec"] = self._reconstruction(net, batch["target"]["points"], generator)

@@ -79,9 +79,7 @@ class Gast(Method):
 
         Where a head knows nothing, a "def" is w_d ln 27 and a "rot" w_r ln 4.
         """
-        name, supervised = source_loss(
-            net, batch["source"], generator, pcm=self.pcm, smoothing=self.smoothing
-        )
+        name, supervised = source_loss(net, batch["source"], generator, self.smoothing, self.pcm)
         terms = {name: self.class_weight * supervised}
         for domain in ("source", "target"):
             points = batch[domain]["points"]

@@ -77,9 +77,7 @@ class Mlsp(Method):
 
         Where the head knows nothing, "cardinality" is 2 w_c ln 16.
         """
-        name, supervised = source_loss(
-            net, batch["source"], generator, pcm=self.pcm, smoothing=self.smoothing
-        )
+        name, supervised = source_loss(net, batch["source"], generator, self.smoothing, self.pcm)
         terms = {name: (1 - self.position_weight) * supervised}
         with use_domain(net, "target"):
             return terms | self._structure(net, batch["target"]["points"], generator)

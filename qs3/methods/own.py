@@ -14,13 +14,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import torch
-from torch import nn
-
 from qs3.errors import ConfigError, MissingDataError
-from qs3.methods.base import Method, total_loss
-
-_CLOUDS = 4
+from qs3.methods.base import Method
 
 
 def own(file: str, sha256: str, **settings: Any) -> Method:
@@ -73,41 +68,3 @@ def _imported(path: Path, source: bytes, sha256: str) -> ModuleType:
         del sys.modules[name]
         raise
     return module
-
-
-def try_step(method: Method, net: nn.Module, classes: int, points: int) -> None:
-    """Prepare a method, and take its loss and the gradient of four random clouds.
-
-    So its errors come before any run begins. A method that prepares each epoch is only prepared:
-    its loss may need what that leaves. Nothing is drawn from torch's global generator.
-
-    Args:
-        method: of `own`.
-        net: [B, N, 3] to logits [B, C], new; it is changed.
-        classes: C.
-        points: N.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        method.prepare(net)
-        if type(method).start_epoch is Method.start_epoch:
-            batch = random_batch(method, classes, points)
-            net.train()
-            terms = method.loss(net, batch, torch.Generator().manual_seed(0))
-            total_loss(method, terms).backward()
-
-
-def random_batch(method: Method, classes: int, points: int) -> dict[str, Any]:
-    """A batch of what the method asks for, of clouds in the unit ball; see `qs3.methods.base`."""
-
-    def clouds() -> torch.Tensor:
-        drawn = torch.randn(_CLOUDS, points, 3)
-        return drawn / drawn.norm(dim=2).amax(dim=1)[:, None, None]
-
-    source = {"points": clouds(), f"y_{method.labels}": torch.arange(_CLOUDS) % classes}
-    if method.again:
-        source["again"] = clouds()
-    batch: dict[str, Any] = {"index": 0, "epoch": 0, "progress": 0.5, "source": source}
-    if method.uses_target:
-        batch["target"] = {"points": clouds()}
-    return batch

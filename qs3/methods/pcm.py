@@ -74,9 +74,8 @@ def source_loss(
     net: nn.Module,
     source: dict[str, Any],
     generator: torch.Generator,
-    *,
-    pcm: bool,
-    smoothing: float = 0.0,
+    smoothing: float,
+    pcm: bool = True,
 ) -> tuple[str, Float[Tensor, ""]]:
     """What methods add their own losses to: "ce", or "pcm" in its place; and its value, >= 0."""
     if not pcm:
@@ -94,6 +93,4 @@ class Pcm(Method):
 
     def loss(self, net: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
         """Mixed cross-entropy, >= 0."""
-        source = batch["source"]
-        mixed, labels_a, labels_b, lam = mix(source["points"], source["y_source"], generator)
-        return {"pcm": pcm_loss(net(mixed), labels_a, labels_b, lam, self.smoothing)}
+        return dict([source_loss(net, batch["source"], generator, self.smoothing)])

@@ -14,17 +14,11 @@ from qs3.kernels.norms import Norm, head_norm, make_norm
 
 
 class Features(NamedTuple):
-    """A backbone's features of a batch of clouds.
+    """A backbone's features of a batch of clouds."""
 
-    Attributes:
-        global_: [B, D] one vector a cloud, D = `Backbone.feature_dim`.
-        per_point: [B, N, C] one vector a point, or None where a backbone has none.
-        regulariser: a term that a backbone wants in the loss (PointNet), unweighted.
-    """
-
-    global_: Float[Tensor, "b d"]
-    per_point: Float[Tensor, "b n c"] | None
-    regulariser: Float[Tensor, ""] | None = None
+    global_: Float[Tensor, "b d"]  # D = `Backbone.feature_dim`
+    per_point: Float[Tensor, "b n c"] | None  # None where a backbone has none
+    regulariser: Float[Tensor, ""] | None = None  # that PointNet wants in the loss, unweighted
 
 
 class Backbone(nn.Module):
@@ -50,11 +44,9 @@ class ClassHead(nn.Sequential):
     Args:
         feature_dim: D of the backbone.
         num_classes: C.
-        hidden: widths between.
-        dropout: after every hidden layer.
+        hidden: widths between, each with `dropout` behind.
         negative_slope: of LeakyReLU; 0 is ReLU.
-        first_bias: False where the first layer is published without one.
-        hidden_bias: False where no hidden layer has one.
+        first_bias, hidden_bias: False where the first, or no, hidden layer has one as published.
         norm: of the backbone; see `qs3.kernels.norms.head_norm` for what it is here.
     """
 

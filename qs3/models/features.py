@@ -45,6 +45,7 @@ class Encoder:
     def __init__(self, data: bytes, sha256: str, where: str) -> None:
         import onnx
         import onnxruntime  # type: ignore[import-untyped]
+        from onnx.external_data_helper import _get_all_tensors, uses_external_data
 
         self.sha256, self.where = sha256, where
         self.known: dict[bytes, Float[np.ndarray, " d"]] = {}
@@ -54,7 +55,8 @@ class Encoder:
         there = onnxruntime.get_available_providers()
         try:
             model = onnx.load_model_from_string(data)
-            assert not _names_files(model), "weights lie in files beside it: export it as one file"
+            beside = any(map(uses_external_data, _get_all_tensors(model)))
+            assert not beside, "weights lie in files next to it: export it as one file"
             self.session = onnxruntime.InferenceSession(
                 data, options, providers=[name for name in _PROVIDERS if name in there]
             )
@@ -136,15 +138,10 @@ def features(
     dropout: float = 0.5,
     norm: Literal["batch", "domain"] = "batch",
 ) -> PointClassifier:
-    """A head on the features that a file's net gives.
+    """A head on the features that the net of an ONNX file gives; no file next to it is read.
 
-    Args:
-        num_classes: C.
-        file: ONNX; no file beside it is read.
-        sha256: 64 hex digits, of its content.
-        hidden: widths of the head; none is a linear probe.
-        dropout: in the head.
-        norm: of the head; of one vector a cloud there is no instance norm.
+    `sha256` is that of its content, in 64 hex digits. With no `hidden` widths the head is a linear
+    probe; its `norm` is not "instance", which one vector a cloud does not have.
 
     Raises:
         MissingDataError: the file is not there.
@@ -177,15 +174,3 @@ def _encoder(file: str, sha256: str) -> Encoder:
 
 def _digest(cloud: Float[np.ndarray, "n 3"]) -> bytes:
     return hashlib.sha256(cloud.tobytes()).digest()
-
-
-def _names_files(message: Any) -> bool:
-    """Whether a tensor anywhere in an ONNX graph lies in another file."""
-    if message.DESCRIPTOR.name == "TensorProto" and message.data_location == message.EXTERNAL:
-        return True
-    for field, value in message.ListFields():
-        if field.message_type is not None:
-            each = value if field.is_repeated else [value]
-            if any(_names_files(one) for one in each):
-                return True
-    return False

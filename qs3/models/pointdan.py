@@ -23,17 +23,11 @@ from qs3.utils.settings import checked
 
 
 class Nodes(NamedTuple):
-    """What the module of nodes makes of a cloud.
+    """What the module of nodes makes of a cloud."""
 
-    Attributes:
-        points: [B, N, 2 C] each point's features and what it gets from its nearest nodes.
-        features: [B, M, C] of the nodes.
-        places: [B, M, 3] where they moved to.
-    """
-
-    points: Float[Tensor, "b n 2*c"]
-    features: Float[Tensor, "b m c"]
-    places: Float[Tensor, "b m 3"]
+    points: Float[Tensor, "b n 2*c"]  # each one's features and what it gets from its nearest nodes
+    features: Float[Tensor, "b m c"]  # of the nodes
+    places: Float[Tensor, "b m 3"]  # where they moved to
 
 
 class NodeModule(nn.Module):

@@ -6,8 +6,6 @@ d = xj - xi; what it is in code is the switch `relation`:
 - "released": as in SimpleView's repository, which the paper's tables come from. xj was overwritten
   by d, and xi is that of the ball's first member: h = (|d_j|, d_first, d_j, d_j). Which member is
   first follows from the order of the points.
-- "original": as in the authors' repository. xj was overwritten there too; a ball is the centre and
-  then points at a distance > 0, so that h = (|d|, 0, d, d), and has one slot more.
 - "paper": h as the paper has it, in absolute coordinates, on balls as in "released".
 """
 
@@ -28,7 +26,7 @@ from qs3.kernels.rsconv import relations, rs_conv
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.utils.settings import checked
 
-Relation = Literal["released", "original", "paper"]
+Relation = Literal["released", "paper"]
 # centres, radius (of a cloud in the unit ball), slots of a ball, of each layer
 LEVELS = ((512, 0.23, 48), (128, 0.32, 64))
 
@@ -92,7 +90,7 @@ class RSConv(nn.Module):
         if self.relation == "paper":
             xi = centres[:, :, None].expand_as(d)
             xj = xi + d
-        else:  # of the ball's first member; in "original" that is the centre itself
+        else:  # of the ball's first member
             xi, xj = d[:, :, :1].expand_as(d), d
         h = torch.cat([d.norm(dim=3, keepdim=True), xi, xj, d], dim=3)  # [b, m, k, 10]
         w = self.weighing(normed(self.mapping_norm, self.mapping(h)).relu())
@@ -130,7 +128,7 @@ class RSCNN(Backbone):
     points. A point has no features of its own.
 
     Args:
-        relation: "released", "original" or "paper", see the module.
+        relation: "released" or "paper", see the module.
         norm: see `qs3.kernels.norms`; statistics are of all slots of all balls.
     """
 
@@ -162,43 +160,13 @@ class RSCNN(Backbone):
     def _forward(self, points: Tensor) -> Tensor:
         features = None
         for layer, (count, radius, slots) in zip(self.layers, LEVELS, strict=True):
-            start = farthest_point_sampling(points, count)
-            centres = gather(points, start)
-            index = group(points, centres, start, radius, slots, self.relation)
+            centres = gather(points, farthest_point_sampling(points, count))
+            index = ball_query(points, centres, radius, slots)
             features = layer(points, features, centres, index)
             points = centres
         assert features is not None
         x = self.last(torch.cat([points, features], dim=2))  # [b, 128, 1024]
         return normed(self.last_norm, x).relu().amax(1)
-
-
-def group(
-    points: Float[Tensor, "b n 3"],
-    centres: Float[Tensor, "b m 3"],
-    index: Int[Tensor, "b m"],
-    radius: float,
-    slots: int,
-    relation: Relation,
-) -> Int[Tensor, "b m k"]:
-    """Members of each ball, the distinct ones first, then copies of the first.
-
-    Args:
-        points: the cloud.
-        centres: some of the points.
-        index: which.
-        radius: of a ball, strict, in the unit of the cloud.
-        slots: members of a ball; with `relation="original"` those next to the centre.
-        relation: see the module.
-    """
-    if relation != "original":
-        return ball_query(points, centres, radius, slots)
-    found = ball_query(points, centres, radius, slots, punctured=True)  # [b, m, slots]
-    first = found[:, :, :1]
-    copy = found == first
-    # an empty ball holds the point nearest to its centre, which is the centre or a copy of it
-    copy[:, :, :1] = (gather(points, first) - centres[:, :, None]).square().sum(3) == 0
-    centre = index[:, :, None]
-    return torch.cat([centre, torch.where(copy, centre, found)], dim=2)
 
 
 @checked

@@ -15,13 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
+from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.kernels import grouped_mlp_max, linear_max, plain, pointwise_max, rsconv
 from qs3.kernels.norms import use_domain
 from qs3.models.dgcnn import DGCNN, EdgeConv
 from qs3.models.pointnet import PointMLP
 from qs3.models.pointnet2 import GroupedMLP
-from qs3.models.rscnn import RSConv, group
+from qs3.models.rscnn import RSConv
 from tests.device import as_on_device, as_on_gpu
 
 Draw = Callable[[int, int], int]
@@ -76,10 +77,9 @@ def rs_conv(draw: Draw, norm: str) -> Case:
     if norm == "instance":  # the kernel takes one cloud
         xyz = xyz[:1]
     features = [torch.randn(*xyz.shape[:2], channels, dtype=torch.float64)] if channels else []
-    start = farthest_point_sampling(xyz, draw(2, 8))
-    centres = gather(xyz, start)
-    relation = ("released", "original", "paper")[draw(0, 2)]
-    index = group(xyz, centres, start, 0.5 + draw(0, 4) / 2, draw(2, 6), relation)
+    centres = gather(xyz, farthest_point_sampling(xyz, draw(2, 8)))
+    relation = ("released", "paper")[draw(0, 1)]
+    index = ball_query(xyz, centres, 0.5 + draw(0, 4) / 2, draw(2, 6))
     layer = RSConv(channels, draw(1, 8), draw(1, 8), relation, norm=norm)
 
     def run(layer: nn.Module, inputs: Inputs) -> Tensor:

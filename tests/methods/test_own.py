@@ -18,9 +18,8 @@ from qs3.datamodules.augment import rotate_z
 from qs3.errors import ConfigError, MissingDataError
 from qs3.methods.base import Method, total_loss
 from qs3.methods.bounds import SourceOnly
-from qs3.methods.own import own, try_step
+from qs3.methods.own import own
 from tests.composing import compose
-from tests.methods.shapes import CLASSES, tiny_net
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "leaderboard.md"
 METHOD = """
@@ -100,12 +99,7 @@ def test_a_run_is_named_by_the_content_not_by_the_place(tmp_path: Path) -> None:
     assert before != name(first)
 
 
-def test_a_loss_that_needs_its_epoch_is_left_alone(tmp_path: Path) -> None:
-    """What `start_epoch` leaves is not there: `prepare` alone is tried."""
-    loss = METHOD.format(name="A").replace("{}", '{"a": self.pool * net(batch["a"]).mean()}')
-    epoch = "    def start_epoch(self, net, data, epoch, epochs):\n        self.pool = 1\n"
-    try_step(of(tmp_path, loss + epoch), tiny_net(), CLASSES, 16)
-    with pytest.raises(AttributeError):
-        try_step(of(tmp_path, loss), tiny_net(), CLASSES, 16)
-    with pytest.raises(ConfigError, match="'b'"):  # it would be summed over the clouds
+def test_a_loss_of_each_cloud_is_refused() -> None:
+    """It would be summed over the clouds."""
+    with pytest.raises(ConfigError, match="'b'"):
         total_loss(SourceOnly(), {"b": torch.ones(4)})
