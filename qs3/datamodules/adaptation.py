@@ -7,7 +7,6 @@ at all: only `qs3.evaluation.metrics` holds them.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,13 +37,10 @@ class AdaptationData(LightningDataModule):
             (`method=supervised`), which alone asks for them.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
         again: whether they hold a second draw of each source cloud.
-        sampler: "shuffled" trains on each labelled cloud once an epoch; "balanced" on as many
-            clouds of each class (see `batches.balanced`). For the source alone: to balance the
-            target's classes takes its true labels.
         make_source: a generated source that is not there is made first.
-        points, scale, fps_starts, val, eval_batch_size, cache_dir, clouds_a_split: see
-            `DomainData`.
-        clouds_a_class: of the labelled domain; see `DomainData`.
+        val, sampler, clouds_a_class: of the labelled domain, see `DomainData`. "balanced" is for
+            the source alone: to balance the target's classes takes its true labels.
+        shared: points, scale, fps_starts, eval_batch_size, cache_dir and clouds_a_split of both.
 
     Attributes:
         labelled_domain, target_domain: what it is composed of.
@@ -65,27 +61,14 @@ class AdaptationData(LightningDataModule):
         owner: str = "source",
         uses_target: bool = False,
         again: bool = False,
-        points: int = 1024,
-        scale: str = "unit_ball",
-        fps_starts: int = 4,
+        make_source: bool = False,
         val: str = "lineage",
         sampler: str = "shuffled",
-        eval_batch_size: int = 64,
-        cache_dir: str | Path | None = None,
-        make_source: bool = False,
-        clouds_a_split: int | None = None,
         clouds_a_class: int | None = None,
+        **shared: Any,
     ) -> None:
         super().__init__()
         assert sampler == "shuffled" or owner == "source"
-        shared: dict[str, Any] = {
-            "points": points,
-            "scale": scale,
-            "fps_starts": fps_starts,
-            "eval_batch_size": eval_batch_size,
-            "cache_dir": cache_dir,
-            "clouds_a_split": clouds_a_split,
-        }
         self.source, self.make_source = source, make_source
         self.labelled_domain = DomainData(
             source if owner == "source" else target,
@@ -97,8 +80,9 @@ class AdaptationData(LightningDataModule):
         self.target_domain = DomainData(target, labels=False, **shared)
         self.owner, self.uses_target, self.again = owner, uses_target, again
         self.phases, self.scheme, self.augment = phases, scheme, augment
-        self.scale = scale
-        self.batch_size, self.eval_batch_size, self.seed = batch_size, eval_batch_size, seed
+        self.scale = self.target_domain.scale
+        self.eval_batch_size = self.target_domain.eval_batch_size
+        self.batch_size, self.seed = batch_size, seed
         self.pseudo: tuple[Tensor, Tensor] | None = None
 
     @property

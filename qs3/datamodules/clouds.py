@@ -155,32 +155,6 @@ class Labelled:
         return dataclasses.replace(self, clouds=part, labels=labels)
 
 
-def prepare(
-    points: Float[np.ndarray, "n p 3"],
-    count: int,
-    *,
-    starts: int = 1,
-    cache_dir: Path | None = None,
-    key: str = "",
-    scale: str = "unit_ball",
-    floor: float = 0.0,
-    names: tuple[str, ...] = (),
-) -> Clouds:
-    """Each cloud about its centroid, and of it `starts` samples of `count` farthest points.
-
-    A cloud is not normalised again after sampling. Evaluation takes sample 0. Which points are
-    farthest does not depend on a cloud's size: all scales share the cached indices.
-
-    Args:
-        points: clouds as stored, e.g. a memmap; kept, not copied.
-        count: points to keep, at most p. If it is p there is nothing to choose.
-        starts, cache_dir, key: see `farthest_points`.
-        scale, floor, names: of the clouds, see `Clouds`.
-    """
-    order = farthest_points(points, count, starts, cache_dir, key)
-    return Clouds.of(points, order, scale, floor, names)
-
-
 def load_clouds(
     dataset: PointSet,
     split: str,
@@ -190,22 +164,17 @@ def load_clouds(
     *,
     scale: str,
 ) -> Clouds:
-    """A split's clouds, prepared (see `prepare`), without their labels.
+    """A split's clouds about their centroids, each in `starts` samples of `points` farthest points.
 
+    They come without their labels, and are not normalised again after sampling. Which points are
+    farthest does not depend on a cloud's size: all scales share the indices in `cache_dir`.
     `scale` has no default: without it a net would silently see clouds of another size.
     """
     part = dataset.split(split)
     assert scale != "above_floor" or dataset.floor_m is not None
-    return prepare(
-        part.points,
-        points,
-        starts=starts,
-        cache_dir=cache_dir,
-        key=f"{dataset.name}-{dataset.sha256[:16]}-{split}",
-        scale=scale,
-        floor=dataset.floor_m or 0.0,
-        names=part.ids,
-    )
+    key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
+    order = farthest_points(part.points, points, starts, cache_dir, key)
+    return Clouds.of(part.points, order, scale, dataset.floor_m or 0.0, part.ids)
 
 
 def labels_of(dataset: PointSet, split: str) -> Int[Tensor, " n"] | None:

@@ -11,8 +11,7 @@ import contextlib
 import hashlib
 import logging
 import os
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,7 +21,7 @@ from jaxtyping import Float, Int
 
 from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
-from qs3.utils.files import atomic_path
+from qs3.utils.files import atomic_path, remove_leftovers
 from qs3.utils.locks import locked
 from qs3.utils.pool import Processes
 from qs3.utils.progress import shown
@@ -32,7 +31,6 @@ log = logging.getLogger(__name__)
 
 _CHUNK = 64  # clouds that a process samples at a time
 WORTH_A_PROCESS = 2000  # samples; about 2 s of work
-_DAY = 24 * 3600  # seconds
 _VERSION = 2  # of the cache: raise it when the samples would be others
 _DIGEST = hashlib.sha256().digest_size
 
@@ -78,6 +76,7 @@ def farthest_points(
     order = read_array(cache, shape, name)
     if order is None:
         with _alone(cache_dir):  # seeds that start at the same time wait for the first
+            remove_leftovers(cache_dir)
             order = read_array(cache, shape, name)
             if order is None:
                 order = keep_array(cache, work(), name)
@@ -121,31 +120,21 @@ def sample_all(
 
     How many, None asks the machine; the result does not depend on it.
     """
-    if processes is None:
+    if processes is None:  # fpsample holds the interpreter's lock, so threads would not help
         processes = min(
             len(os.sched_getaffinity(0)), len(points) * starts // WORTH_A_PROCESS, len(points)
         )
     result = np.empty((len(points), starts, count), dtype=_index_type(points.shape[1]))
     begins = range(0, len(points), _CHUNK)
-    if processes > 1:  # fpsample holds the interpreter's lock, so threads would not help
-        try:
-            _fill(result, points, begins, processes)
-            return result
-        except OSError as error:  # out of memory, or no more processes
-            log.warning("sampling in one process, because several failed (%s)", error)
-    _fill(result, points, begins, 0)
-    return result
-
-
-def _fill(result: np.ndarray, points: np.ndarray, begins: Sequence[int], processes: int) -> None:
     chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
-    _, starts, count = result.shape
-    outcomes = Processes(processes).run(partial(_sampler, count, starts), chunks)
+    pool = Processes(processes if processes > 1 else 0)
+    outcomes = pool.run(partial(_sampler, count, starts), chunks)
     for outcome in shown(outcomes, "sampling points", total=len(begins)):
         if outcome.result is None:
             raise ChildProcessError("a process died twice")
         begin = int(outcome.name)
         result[begin : begin + len(outcome.result)] = outcome.result
+    return result
 
 
 def _sampler(count: int, starts: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -154,14 +143,6 @@ def _sampler(count: int, starts: int) -> Callable[[np.ndarray], np.ndarray]:
 
 def _index_type(points: int) -> type[np.signedinteger]:
     return np.int16 if points <= np.iinfo(np.int16).max else np.int32
-
-
-def remove_old_leftovers(cache_dir: Path) -> None:
-    """Delete what killed processes have left half written: if a day old, for others write here."""
-    for path in cache_dir.glob(".*.npy.*.tmp.npy"):
-        with contextlib.suppress(OSError):  # another run was quicker, or may and we may not
-            if time.time() - path.stat().st_mtime > _DAY:
-                path.unlink()
 
 
 # The cache's file is an .npy with 32 bytes after it: SHA-256 of what it is and of what it holds.

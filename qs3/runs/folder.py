@@ -34,8 +34,7 @@ from qs3.utils.files import write_json
 from qs3.utils.locks import owned
 
 STARTED = "started.json"
-ANEW = "choose another experiment_name, or start again with force=true"
-"""What to do about a run that cannot be continued."""
+_ANEW = "choose another experiment_name, or start again with force=true"
 
 _KEPT_WHEN_CLEARED = (".hydra", ".lock")
 _OF_A_START = ("train.log", ".lock", STARTED, ".hydra")
@@ -68,29 +67,21 @@ def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:
     write_json(Path(folder) / STARTED, started)
 
 
-def check_data(folder: Path, domain: str, expected: str, found: str, instead: str = ANEW) -> None:
-    """Refuse to continue, or to reuse, a run whose data have changed since.
-
-    Raises:
-        DataError: the hashes differ. `instead`: of bringing the old data back.
-    """
+def check_data(folder: Path, domain: str, expected: str, found: str) -> None:
+    """Raise DataError rather than continue, or reuse, a run whose data have changed since."""
     if found != expected:
         raise DataError(
             f"{folder} was begun with another version of {domain} ({expected[:12] or 'without it'},"
-            f" now {found[:12] or 'without it'}); bring the old data back, {instead}"
+            f" now {found[:12] or 'without it'}); bring the old data back, {_ANEW}"
         )
 
 
-def check_config(folder: Path, expected: str | None, found: str, instead: str = ANEW) -> None:
-    """Refuse to continue, or to reuse, the run of another config (of the same 8 digits).
-
-    Raises:
-        ConfigError: the hashes differ. `instead`: of it.
-    """
+def check_config(folder: Path, expected: str | None, found: str) -> None:
+    """Raise ConfigError rather than continue, or reuse, the run of another config."""
     if found != expected:
         raise ConfigError(
             f"{folder} holds a run with other settings (config hash {expected}, now {found}; they "
-            f"are in .hydra/config.yaml); {instead}"
+            f"are in .hydra/config.yaml); {_ANEW}"
         )
 
 

@@ -9,11 +9,6 @@ training split, and the selected part becomes the datamodule's next training set
 optimiser are reset at the start of the next epoch (`on_train_epoch_start`), not before:
 checkpoints are written in between, and must hold the trained model. Whether a reset is due
 follows from the epoch alone, so there is no flag that a resume could lose.
-
-With `init=continue` round 0 goes on with the teacher that labelled it, which is the warm-up's
-selected epoch and seldom its last; each further round goes on with the student before.
-With `init=persistent` round 0 begins with new weights, and the further rounds also keep the
-optimiser's moments.
 """
 
 from __future__ import annotations
@@ -43,7 +38,6 @@ from qs3.selftraining.selectors import (
     TeacherPredictions,
     check_selection,
     chosen_by,
-    keep_all,
 )
 
 log = logging.getLogger(__name__)
@@ -53,10 +47,9 @@ WARMUP_LAST = "warmup_last.pt"
 
 
 class WarmupSelection(Callback):
-    """Keeps the warm-up's weights with the best validation accuracy, the earliest on ties.
+    """Saves the warm-up's weights with the best validation accuracy, the earliest on ties.
 
-    Never looks at the target. At the end of the warm-up it saves them as `warmup_selected.pt`,
-    and the last ones as `warmup_last.pt`.
+    Never looks at the target. They become `warmup_selected.pt`, the last ones `warmup_last.pt`.
 
     Args:
         folder: of the run.
@@ -160,7 +153,9 @@ class SelfTraining(Callback):
         if selection.labels is not None:  # a selector may name another class than the most probable
             teacher = teacher.relabelled(selection.labels)
         if self.scheme.rehearsal:
-            selection = keep_all(selection, teacher.predicted)
+            kept = np.bincount(teacher.predicted, minlength=len(self.classes))
+            every = np.ones(len(teacher.ids), dtype=bool)
+            selection = dataclasses.replace(selection, selected=every, kept=kept)
         if trainer.is_global_zero:
             write_pseudo_labels(
                 pseudo_labels_path(self.folder, round_),
@@ -182,7 +177,10 @@ class SelfTraining(Callback):
         self.records.append(self._record(round_, selection, labels, missing))
         self._previous = labels
         if trainer.is_global_zero:
-            _log(self.records[-1], len(labels))
+            figures = (round_, theta, selection.confident.sum(), len(labels), len(index))
+            log.info("round %d: theta %.3f, %d of %d samples confident, %d selected", *figures)
+            if missing:
+                log.warning("round %d: no pseudo-label for %s", round_, ", ".join(missing))
 
     def _predictions(
         self, trainer: Trainer, pl_module: Classifier, data: AdaptationData, round_: int
@@ -229,21 +227,3 @@ class SelfTraining(Callback):
         """Restore `state_dict`."""
         self.records = [RoundRecord(**record) for record in state_dict["records"]]
         self._previous = state_dict["previous"]
-
-
-def _log(record: RoundRecord, clouds: int) -> None:
-    log.info(
-        "round %d: theta %.3f, %d of %d target samples confident, %d selected%s",
-        record.round,
-        record.theta,
-        record.total_confident,
-        clouds,
-        record.total_selected,
-        ""
-        if record.agreement is None
-        else f", {record.agreement:.1%} of all labels as in the round before",
-    )
-    if record.missing_classes:
-        log.warning(
-            "round %d: no pseudo-label for %s", record.round, ", ".join(record.missing_classes)
-        )

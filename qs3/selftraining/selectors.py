@@ -264,12 +264,6 @@ def chosen_by(
     return replace(found, kept=kept)
 
 
-def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
-    """The same with every sample selected."""
-    kept = np.bincount(labels, minlength=len(selection.kept))
-    return replace(selection, selected=np.ones(len(labels), dtype=bool), kept=kept)
-
-
 def check_selection(
     selection: Selection,
     class_names: Sequence[str],
@@ -279,16 +273,9 @@ def check_selection(
 ) -> list[str]:
     """Names of the classes without a pseudo-label, after checking that training is possible.
 
-    Args:
-        selection: of the round.
-        class_names: in label order.
-        round_: for messages.
-        missing_class: "warn" or "error".
-        processes: that share the samples out, one of them to two where they come out uneven.
-
     Raises:
-        SelectionError: a process has fewer than two samples (batch normalisation needs two), or
-            a class is missing and `missing_class` is "error".
+        SelectionError: one of the `processes` has fewer than two samples (batch normalisation needs
+            two), or a class is missing and `missing_class` is "error".
     """
     missing = [name for name, n in zip(class_names, selection.kept, strict=True) if n == 0]
     total = int(selection.kept.sum())

@@ -39,16 +39,10 @@ log = logging.getLogger(__name__)
 STUDENT_SELECTED = "student_selected.pt"
 
 
-def _finite(score: float | None) -> float | None:
-    # Not finite: of a net that has diverged.
-    return score if score is not None and math.isfinite(score) else None
-
-
 class StudentSelection(Callback):
     """Scores each epoch of the last round; saves the best weights as `student_selected.pt`.
 
-    It belongs behind `SelfTraining` in the list of callbacks, whose last selection it divides, and
-    before the checkpoint. Figures of every process are those of the first one.
+    It belongs behind `SelfTraining`, whose last selection it divides, and before the checkpoint.
 
     Args:
         folder: of the run.
@@ -82,34 +76,25 @@ class StudentSelection(Callback):
             self._hold_out(data, trainer.world_size)
         if phase != last_phase:
             return
-        self._compare(trainer, pl_module, data, epoch)
+        # One process scores for all: batch norm's statistics differ between processes.
+        mine = self._score(pl_module.net, data, pl_module) if trainer.is_global_zero else 0.0
+        score = self.scores[epoch] = float(trainer.strategy.broadcast(mine))
+        if is_better(self.rule, score, self.score):
+            self.epoch, self.score = epoch, score
+            self._weights = copy_weights(pl_module.net)
         if ends:
             if trainer.is_global_zero:
                 save(self._weights, self.folder / STUDENT_SELECTED)
             self._weights = None
         trainer.strategy.barrier("epoch of the student kept")
 
-    def _compare(
-        self, trainer: Trainer, classifier: Classifier, data: AdaptationData, epoch: int
-    ) -> None:
-        # One process scores for all: batch norm's statistics differ between processes.
-        mine = self._score(classifier.net, data, classifier) if trainer.is_global_zero else 0.0
-        score = float(trainer.strategy.broadcast(mine))
-        self.scores[epoch] = score
-        if is_better(self.rule, score, self.score):
-            self.epoch, self.score = epoch, score
-            self._weights = copy_weights(classifier.net)
-
     def _score(self, net: nn.Module, data: AdaptationData, classifier: Classifier) -> float:
-        clouds = data.target
+        clouds, how = data.target, (data.eval_batch_size, classifier.device)
         if self.rule != PSEUDO_VAL:
-            table = predict(net, clouds.points, data.eval_batch_size, classifier.device)
-            return LABEL_FREE[self.rule].score(table)
+            return LABEL_FREE[self.rule].score(predict(net, clouds.points, *how))
         assert self.held_out is not None
         index, labels = self.held_out
-        table = predict(
-            net, clouds.at(index.numpy()).points, data.eval_batch_size, classifier.device
-        )
+        table = predict(net, clouds.at(index.numpy()).points, *how)
         return float((table.argmax(axis=1) == labels.numpy()).mean())
 
     def _hold_out(self, data: AdaptationData, processes: int = 1) -> None:
@@ -139,9 +124,7 @@ class StudentSelection(Callback):
         log.info("round %d: %d pseudo-labelled samples held out", round_, int(held.sum()))
 
     def state_dict(self) -> dict[str, Any]:
-        """Scores, the best epoch and its weights, the held-out clouds; {} while there are none."""
-        if not self.scores and self.held_out is None:
-            return {}
+        """Scores, the best epoch and its weights, the held-out clouds."""
         return {
             "scores": dict(self.scores),
             "epoch": self.epoch,
@@ -167,12 +150,13 @@ class StudentSelection(Callback):
         return f"{self.rule}, epoch {self.epoch}, score {self.score:.6g}"
 
     def record(self) -> dict[str, Any]:
-        """What `metrics.json` has under `student`."""
+        """What `metrics.json` has under `student`; None for scores of a net that has diverged."""
+        known = {e: score if math.isfinite(score) else None for e, score in self.scores.items()}
         return {
             "rule": self.rule,
             "epoch": self.epoch,
-            "score": _finite(self.score),
-            "scores": {str(epoch): _finite(score) for epoch, score in self.scores.items()},
+            "score": None if self.epoch is None else known[self.epoch],
+            "scores": {str(epoch): score for epoch, score in known.items()},
             "held_out": 0 if self.held_out is None else len(self.held_out[0]),
         }
 

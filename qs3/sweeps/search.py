@@ -133,7 +133,7 @@ class LabelFreeSearch(OverLauncher):
 
         for trial in study.get_trials(states=(TrialState.COMPLETE,)):
             cfg = self._composed([*fixed, *_overrides(words(trial.params))])
-            if check_finished(cfg, "or begin another search with another experiment_name"):
+            if check_finished(cfg):
                 return
 
     def _composed(self, overrides: Sequence[str]) -> DictConfig:

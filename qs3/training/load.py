@@ -23,8 +23,7 @@ from qs3.evaluation.prior import ESTIMATED, Prior, estimate_shares, read_prior, 
 from qs3.inference.model_file import Result, read_result
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf, RoundRecord
-from qs3.store.meta import read_manifest
-from qs3.store.store import PointSet
+from qs3.store.meta import ManifestRow, read_manifest
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
 
@@ -132,13 +131,15 @@ def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
         log.warning("%s has no labels for a test: only predictions are counted", target.name)
     cache, scale = data.target_domain.cache_dir, cfg.data.scale
     rows = read_manifest(run.target.folder, target.classes)
+    known = labels_of(target, "train")
+    ids = target.split("train").ids
     evaluation = Evaluation(
         load_clouds(target, split, cfg.data.points, cache_dir=cache, scale=scale),
         labels_of(target, split) if split == "test" else None,
-        _labels_by_id(target, "train"),
+        None if known is None else dict(zip(ids, known.tolist(), strict=True)),
         target.classes,
         cfg.evaluation.rotations,
-        _objects_by_id(target, run.target),
+        objects_by_id(rows, run.target),
         {row.id: tier for row in rows if (tier := row.more.get("tier"))},
     )
     tested = [evaluation.test] if split == "test" else []  # else they are those for training
@@ -176,19 +177,12 @@ def prior_beside(
     return read_prior(given, classes, learnt, settings.prior_power)
 
 
-def _labels_by_id(dataset: PointSet, split: str) -> dict[str, int] | None:
-    labels = labels_of(dataset, split)
-    if labels is None:
-        return None
-    return dict(zip(dataset.split(split).ids, labels.tolist(), strict=True))
-
-
-def _objects_by_id(dataset: PointSet, domain: Domain) -> dict[str, str]:
+def objects_by_id(rows: Sequence[ManifestRow], domain: Domain) -> dict[str, str]:
     """What each cloud shows: its mesh, or what the publisher's ids tell; where that is known."""
     importer = domain.importer()
-    of_id = importer.object_of if importer else lambda _: ""
-    rows = read_manifest(domain.folder, dataset.classes)
-    known = {row.id: row.mesh_sha256 or of_id(row.id) for row in rows}
+    known = {
+        row.id: row.mesh_sha256 or (importer.object_of(row.id) if importer else "") for row in rows
+    }
     return {id_: name for id_, name in known.items() if name}
 
 

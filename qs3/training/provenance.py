@@ -39,7 +39,6 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
     """Read `started.json` and compare it with today's data, or write it; `force` begins anew."""
     import torch
 
-    from qs3.datamodules.fps_samples import remove_old_leftovers
     from qs3.runs.checkpoints import LAST
 
     weights = {"weights": _weights(run.cfg)} if run.cfg.weights is not None else {}
@@ -59,8 +58,6 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
         runs.clear(run.folder)
     for folder in (run.folder, *run.folder.glob("round_*")):
         remove_leftovers(folder)
-    if run.cfg.data.cache_dir:
-        remove_old_leftovers(Path(run.cfg.data.cache_dir))
     started = runs.read_started(run.folder)
     if started is not None:
         compare(run.folder, started, now)
@@ -135,10 +132,8 @@ _QS3 = "qs3's code"
 _VERSIONED = ("qs3.", "torch.", "lightning.")  # by `PACKAGES`, or by their versions
 
 
-def check_finished(cfg: DictConfig, instead: str = runs.ANEW) -> bool:
+def check_finished(cfg: DictConfig) -> bool:
     """Whether the run that `cfg` describes is finished.
-
-    `instead`: of bringing the old data back, for people.
 
     Raises:
         DataError, ConfigError: it is, and its data, its classifier or its settings have changed.
@@ -146,30 +141,30 @@ def check_finished(cfg: DictConfig, instead: str = runs.ANEW) -> bool:
     run = run_of(cfg)
     metrics = read_metrics(run.folder)
     if metrics is not None:
-        refuse_changed(run, metrics, instead)
+        refuse_changed(run, metrics)
     return metrics is not None
 
 
-def refuse_changed(run: Run, metrics: RunMetrics, instead: str = runs.ANEW) -> None:
+def refuse_changed(run: Run, metrics: RunMetrics) -> None:
     """Raise if what is there is not what the finished run used; datasets may have been put away.
 
     Raises:
         DataError, ConfigError: names what it is.
     """
     now = hashing.config_sha256(run.cfg)
-    runs.check_config(run.folder, metrics.config_sha256, now, instead)
+    runs.check_config(run.folder, metrics.config_sha256, now)
     used = {"source": run.source, "target": run.target}
     if run.is_upper_bound:
         del used["source"]
     for role, domain in used.items():
         if is_finished(domain.folder):
             was, now = getattr(metrics.data, role), domain.open(verify=False).sha256
-            runs.check_data(run.folder, domain.name, was, now, instead)
+            runs.check_data(run.folder, domain.name, was, now)
     if run.cfg.weights is not None:
         with contextlib.suppress(MissingDataError):
             name, _, sha256 = _weights(run.cfg).rpartition(" ")
             was = _sha256_of(metrics.versions)
-            runs.check_data(run.folder, f"the classifier {name}", was, sha256, instead)
+            runs.check_data(run.folder, f"the classifier {name}", was, sha256)
 
 
 def files_sha256(cfg: DictConfig) -> dict[str, str]:

@@ -18,7 +18,8 @@ import qs3
 from qs3.catalogue import Catalogue
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
-from qs3.datamodules.clouds import Labelled, prepare
+from qs3.datamodules.clouds import Clouds, Labelled
+from qs3.datamodules.fps_samples import farthest_points
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datasets.domain import Domain
 from qs3.generation.camera_poses import AnchoredViews
@@ -124,7 +125,7 @@ def test_loading(
     np.save(tmp_path / "points.npy", stored)
     mapped = np.load(tmp_path / "points.npy", mmap_mode="r")
     ids = tuple(f"{i:05d}" for i in range(clouds))
-    kept = prepare(mapped, 1024, starts=4, cache_dir=tmp_path, key="benchmark", names=ids)
+    kept = Clouds.of(mapped, farthest_points(mapped, 1024, 4, tmp_path, "benchmark"), names=ids)
     domain = Domain("made", "M", "Made", "nowhere")
     data = AdaptationData(
         domain, domain, phases=Phases(200), scheme=SelfTrainingConfig(), augment=Augment(),

@@ -184,13 +184,6 @@ def test_the_task_during_which_a_job_ended_is_charged(tmp_path):
     assert deaths == {"2": 1, "4": 1}
 
 
-def test_a_jobs_error_is_raised_here(tmp_path):
-    one = _Job(Handle(), [("bad", ("fail", "bad")), ("1", 1)], tmp_path / "journal-a")
-    _do_chunk(make_worker(tmp_path), one.chunk, one.journal)
-    with pytest.raises(MeshError, match="no faces"):
-        list(one.new_outcomes())
-
-
 def test_a_job_of_which_slurm_says_nothing_ends_some_time(tmp_path):
     one = job(tmp_path, "1")
     assert not one.ended(limit_s=0)  # it may still be waiting in the queue

@@ -64,12 +64,3 @@ def test_a_batch_is_a_copy(mapped):
     whole = Clouds.of(STORED.copy())
     whole.take(torch.tensor([1])).zero_()
     assert np.array_equal(whole.stored, STORED)
-
-
-def test_a_part_shares_the_clouds(mapped):
-    part = mapped.at(np.array([4, 2]))
-    assert len(part) == 2
-    assert part.stored is mapped.stored
-    assert torch.equal(part.points, mapped.points[[4, 2]])
-    again = part.at(np.array([False, True]))
-    assert torch.equal(again.points, mapped.points[[2]])

@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 
 from qs3.config.compose import composed
 from qs3.config.location import CONF
-from qs3.datamodules import DomainData
 from qs3.datamodules.augment import Augment
+from qs3.datamodules.domain import DomainData
 from tests.training.toy import write_domain
 
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.datamodules.clouds import Clouds, prepare
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.fps_samples import farthest_points
 from qs3.evaluation.ood import (
     MEASURES,
     limits,
@@ -17,6 +18,10 @@ from qs3.evaluation.ood import (
     relax_min_points,
 )
 from qs3.geometry.sampling import unit_ball
+
+
+def prepare(points: np.ndarray, count: int, scale: str = "unit_ball", floor: float = 0.0) -> Clouds:
+    return Clouds.of(points, farthest_points(points, count), scale, floor)
 
 
 def measured(cloud: np.ndarray) -> dict[str, float]:

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import qs3
-from qs3.datamodules import DomainData
+from qs3.datamodules.domain import DomainData
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.inference.predictor import resample

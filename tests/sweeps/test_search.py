@@ -6,7 +6,6 @@ import logging
 import math
 import re
 import shlex
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
-from qs3.evaluation.validators import LABEL_FREE, OBJECTIVES, check_objective
+from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.search import Tried, check_varied, distribution, report, split, words
 from qs3.training.command import judged, objective_of, train
 from qs3.utils.locks import locked
@@ -109,14 +108,12 @@ def test_unfair_searches_are_refused_before_a_job(sweep, words, tmp_path):
 @pytest.mark.parametrize(
     "word",
     [
-        "objective=entropy,infomax", "seed=range(0,3)", "selection.student=last,snd",
-        "selection={student:last},{student:snd}", "data.points=512,1024",
-        "data.sampler=choice(shuffled,balanced)", "domain@data.target=kinectsim10,depthscannet10",
-        "model@data.target=a,b", "+experiment=qs3_s2d,own_scans", "evaluation.rotations=range(0,4)",
-        "num_classes=10,11", "paths.log_dir=a,b", "logger=csv,wandb", "debug=fast,overfit",
-        "hparams_search=qbst_optuna,null", "experiment_name=a,b", "methods=a,b",
+        *("objective=entropy,infomax", "seed=range(0,3)", "selection.student=last,snd"),
+        *("selection={student:last},{student:snd}", "data.sampler=choice(shuffled,balanced)"),
+        *("domain@data.target=kinectsim10,depthscannet10", "model@data.target=a,b"),
+        *("+experiment=qs3_s2d,quickstart", "methods=a,b"),
     ],
-)  # fmt: skip
+)
 def test_keys_that_do_not_vary(word):
     key, _, value = word.partition("=")
     for arguments, params in (([word, "method=dann,pcm"], {}), ([], {key: value})):
@@ -134,18 +131,8 @@ def test_what_may_vary():
     check_varied(varied.values())
 
 
-def test_objectives_are_label_free():
-    assert set(OBJECTIVES) == set(LABEL_FREE)
-    check_objective(None)
-    check_objective("infomax")
-    for refused in ("accuracy", "pseudo_val"):
-        with pytest.raises(ConfigError):
-            check_objective(refused)
-
-
-@pytest.mark.slow
 def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
-    """With rounds and without; by `selection.student` the last epoch's score is the same one."""
+    """With `selection.student` the last epoch's score is the same one."""
     metrics = train(toy("selection.student=infomax", "selftraining.epochs=1"))
     only = metrics.student.score  # one epoch to choose from, and it is reported
     assert metrics.validators["infomax"] == only
@@ -153,43 +140,25 @@ def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
     assert objective_of(toy("objective=infomax"), metrics) == only
     assert objective_of(toy(), metrics) is None
 
-    metrics = train(toy("selection.student=pseudo_val"))
-    assert metrics.validators["pseudo_val"] == metrics.student.score
-    cfg = toy("selftraining=none", "objective=entropy")
-    metrics = train(cfg)
-    assert 0 <= objective_of(cfg, metrics) == metrics.validators["entropy"] <= 1.0987
-    # as `qs3.training.evaluate.without_labels` says it
-    lost = replace(metrics, validators={**metrics.validators, "entropy": None})
-    assert math.isnan(objective_of(cfg, lost))
-    assert judged(cfg, lost).endswith(": objective=entropy none: the net has diverged")
-
 
 def test_a_run_that_really_diverges_is_finished_and_has_none(toy):  # noqa: F811
-    words = ("selftraining=none", "protocol.optimizer.lr=1e30", "protocol.epochs=1")
-    metrics = train(toy(*words))
-    assert metrics.validators == dict.fromkeys(OBJECTIVES)
+    cfg = toy("selftraining=none", "protocol.optimizer.lr=1e30", "objective=snd")
+    metrics = train(cfg)
+    assert metrics.validators == dict.fromkeys(LABEL_FREE)
     assert metrics.final.calibration_error is None
-    for objective in OBJECTIVES:
-        cfg = toy(*words, f"objective={objective}")
-        assert math.isnan(objective_of(cfg, metrics))
-        assert judged(cfg, train(cfg)).endswith("none: the net has diverged")
+    assert math.isnan(objective_of(cfg, metrics))
+    assert judged(cfg, metrics).endswith("none: the net has diverged")
 
 
 def test_a_trial_says_its_objective_and_no_accuracy(toy, caplog):  # noqa: F811
     """Nor when it was finished before; metrics.json has all."""
     words = ["selftraining=none", "protocol.epochs=1"]
     with caplog.at_level(logging.INFO):
-        metrics = train(toy(*words, "objective=infomax"))
+        train(toy(*words, "objective=infomax"))
         train(toy(*words, "objective=entropy"))
-    assert 0 <= metrics.final.accuracy <= 1
     assert "accuracy" not in caplog.text.lower()
-    for name in ("infomax", "entropy"):
-        score = metrics.validators[name]
-        assert f"quickstart, seed 0: objective={name} {score:.4f}" in caplog.messages
-    caplog.clear()
-    with caplog.at_level(logging.INFO):
-        train(toy(*words))
-    assert "accuracy" in caplog.text
+    assert re.search(r"objective=infomax \d\.\d{4}", caplog.text)
+    assert re.search(r"objective=entropy \d\.\d{4}", caplog.text)
 
 
 def parsed(text: str):
@@ -319,10 +288,3 @@ def test_a_search_with_trainings(tmp_path, toy_data):  # noqa: F811
     assert result.returncode == 1
     assert "another version of specklenet10" in result.stderr
     assert "Best: trial" not in result.stdout
-    grid = [*overrides(tmp_path, f"paths.data_dir={toy_data}"), GRID, "selftraining.theta=0.4"]
-    result = command(
-        tmp_path, *grid, "selftraining.epsilon=0.0", "selftraining.rounds=1,2", "logger=wandb", "-m"
-    )
-    assert result.returncode == 0, result.stderr
-    assert len(table(result.stdout)) == 2
-    assert "accura" not in (result.stdout + result.stderr).lower()

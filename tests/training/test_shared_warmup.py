@@ -12,13 +12,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
 from omegaconf import OmegaConf
 
 from qs3.config import hashing
-from qs3.engine.checkpointing import SaveLast
 from qs3.runs.checkpoints import load
-from qs3.runs.metrics import read_metrics
 from qs3.training import resume
 from qs3.training.command import train
 from qs3.training.resume import SharedWarmup, warmup_sha256
@@ -41,104 +38,7 @@ def flipped(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
 
 
-# Lightning asks torch for what torch gives up; nothing here is on a GPU or in several processes.
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.* is deprecated:FutureWarning"),
-    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
-]
 SHA256 = "0123456789abcdef" * 4
-
-
-class Epochs(Callback):
-    """The history of a run: the epochs that are over."""
-
-    def __init__(self, folder: Path) -> None:
-        self.file = folder / "history.csv"
-
-    def on_train_epoch_end(self, trainer, pl_module):
-        with self.file.open("a") as file:
-            file.write(f"{trainer.current_epoch}\n")
-
-
-class Quick(LightningModule):
-    """One weight, one step an epoch."""
-
-    def __init__(self):
-        super().__init__()
-        self.net = torch.nn.Linear(1, 1)
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-    def training_step(self, batch, i):
-        return self.net(batch).sum()
-
-
-def trained(folder: Path, shared: SharedWarmup, epochs: int = 6) -> None:
-    """A run of some net, with the callbacks in the order of `fit`."""
-    folder.mkdir(exist_ok=True)
-    callbacks = [Epochs(folder), SaveLast(folder), shared]
-    quiet = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False)
-    Trainer(
-        max_epochs=epochs,
-        callbacks=callbacks,
-        accelerator="cpu",
-        default_root_dir=folder,
-        log_every_n_steps=1,
-        **quiet,
-    ).fit(Quick(), torch.utils.data.DataLoader(torch.ones(1, 1)))
-
-
-@pytest.mark.parametrize("warmup", [1, 2, 3, 5, 6])
-def test_it_is_shared_one_epoch_before_its_end_and_once(tmp_path, warmup, caplog):
-    (tmp_path / "b").mkdir()
-    where = tmp_path / "warmups" / "01234567-seed7"
-    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", where.parent, SHA256, 7, warmup))
-    other = SharedWarmup(tmp_path / "b", where.parent, SHA256, 7, warmup)
-    if warmup == 1:
-        assert not where.exists()
-        assert not other.take()
-        return
-    assert (where / "history.csv").read_text().split() == [str(i) for i in range(warmup - 1)]
-    files = {name: sha256_file(where / name) for name in ("history.csv", "last.ckpt")}
-    mark = {"warmup_sha256": SHA256, "files": files}
-    assert json.loads((where / "started.json").read_text()) == mark
-    assert load(where / "last.ckpt")["epoch"] == warmup - 2
-    assert other.take()
-    assert f"going on from {where}" in caplog.text
-    for name in files:
-        assert (tmp_path / "b" / name).read_bytes() == (where / name).read_bytes()
-    assert not other.take()  # it has begun
-    changed = where.stat().st_mtime_ns, (where / "last.ckpt").stat().st_mtime_ns
-    trained(tmp_path / "c", SharedWarmup(tmp_path / "c", where.parent, SHA256, 7, warmup))
-    assert (where.stat().st_mtime_ns, (where / "last.ckpt").stat().st_mtime_ns) == changed
-
-
-def test_what_a_copy_that_was_killed_left_is_cleared(tmp_path):
-    where = tmp_path / "warmups" / "01234567-seed7"
-    where.mkdir(parents=True)
-    (where / ".last.ckpt.abc.tmp.ckpt").write_text("half")
-    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", where.parent, SHA256, 7, 3))
-    assert sorted(path.name for path in where.glob("*.ckpt")) == ["last.ckpt"]
-
-
-@pytest.mark.parametrize("different", ["sha256", "seed", "nothing is shared"])
-def test_nobody_elses_is_taken(tmp_path, different, caplog):
-    (tmp_path / "b").mkdir()
-    warmups = tmp_path / "warmups"
-    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", warmups, SHA256, 7, 3), epochs=3)
-    given = {
-        "sha256": (warmups, SHA256[:-1] + "0", 7, 3),  # of the same name
-        "seed": (warmups, SHA256, 8, 3),
-        "nothing is shared": (None, SHA256, 7, 3),
-    }[different]
-    mine = SharedWarmup(tmp_path / "b", *given)
-    assert not mine.take()
-    assert not any((tmp_path / "b").iterdir())
-    assert ("is damaged" in caplog.text) == (different == "sha256")
-    trained(tmp_path / "b", mine, epochs=3)
-    assert len(list(warmups.iterdir())) == (2 if different == "seed" else 1)
-    assert mine.take() is False
 
 
 def started(folder: Path) -> Path:
@@ -149,16 +49,66 @@ def started(folder: Path) -> Path:
     return folder
 
 
-def give(warmups: Path, folder: Path) -> None:
-    over = SimpleNamespace(current_epoch=0, is_global_zero=True)
-    SharedWarmup(folder, warmups, SHA256, 7, 2).on_train_epoch_end(over, None)
+def give(warmups: Path, folder: Path, epoch: int = 0, warmup: int = 2) -> None:
+    """What the run does at the end of an epoch."""
+    over = SimpleNamespace(current_epoch=epoch, is_global_zero=True)
+    SharedWarmup(folder, warmups, SHA256, 7, warmup).on_train_epoch_end(over, None)
+
+
+def one_that_takes(folder: Path, warmups: Path | None, sha256: str = SHA256, seed: int = 7):
+    folder.mkdir(exist_ok=True)
+    return SharedWarmup(folder, warmups, sha256, seed, 3)
+
+
+@pytest.mark.parametrize("warmup", [1, 2, 3, 6])
+def test_it_is_shared_one_epoch_before_its_end_and_once(tmp_path, warmup, caplog):
+    warmups, first = tmp_path / "warmups", started(tmp_path / "first")
+    where = warmups / "01234567-seed7"
+    for epoch in range(warmup + 2):
+        give(warmups, first, epoch, warmup)
+        assert where.exists() == (0 <= warmup - 2 <= epoch)
+    other = one_that_takes(tmp_path / "other", warmups)
+    if warmup == 1:
+        assert not other.take()
+        return
+    files = {name: sha256_file(where / name) for name in ("history.csv", "last.ckpt")}
+    mark = {"warmup_sha256": SHA256, "files": files}
+    assert json.loads((where / "started.json").read_text()) == mark
+    assert other.take()
+    assert f"going on from {where}" in caplog.text
+    for name in files:
+        assert (other.folder / name).read_bytes() == (where / name).read_bytes()
+    assert not other.take()  # it has begun
+    give(warmups, started(tmp_path / "second"), warmup - 2, warmup)
+    assert (where / "last.ckpt").read_text() == "last.ckpt of first"
+
+
+def test_what_a_copy_that_was_killed_left_is_cleared(tmp_path):
+    where = tmp_path / "warmups" / "01234567-seed7"
+    where.mkdir(parents=True)
+    (where / ".last.ckpt.abc.tmp.ckpt").write_text("half")
+    give(tmp_path / "warmups", started(tmp_path / "first"))
+    assert sorted(path.name for path in where.glob("*.ckpt")) == ["last.ckpt"]
+
+
+@pytest.mark.parametrize("different", ["sha256", "seed", "nothing is shared"])
+def test_nobody_elses_is_taken(tmp_path, different, caplog):
+    warmups, mine = tmp_path / "warmups", tmp_path / "mine"
+    give(warmups, started(tmp_path / "first"))
+    one = {
+        "sha256": one_that_takes(mine, warmups, SHA256[:-1] + "0"),  # of the same name
+        "seed": one_that_takes(mine, warmups, seed=8),
+        "nothing is shared": one_that_takes(mine, None),
+    }[different]
+    assert not one.take()
+    assert not any(mine.iterdir())
+    assert ("is damaged" in caplog.text) == (different == "sha256")
 
 
 def test_runs_that_start_together_share_one(tmp_path, caplog, monkeypatch):
     """Others come while the first one's files are there and their mark is not."""
     warmups, second = tmp_path / "warmups", started(tmp_path / "second")
-    (tmp_path / "third").mkdir()
-    third = SharedWarmup(tmp_path / "third", warmups, SHA256, 7, 2)
+    third = one_that_takes(tmp_path / "third", warmups)
     found, threads = [], []
 
     def come_meanwhile(source: Path, target: Path) -> None:
@@ -177,8 +127,7 @@ def test_runs_that_start_together_share_one(tmp_path, caplog, monkeypatch):
     assert found == [True]  # it waited for the mark
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     assert (tmp_path / "third" / "last.ckpt").read_text() == "last.ckpt of first"
-    (tmp_path / "fourth").mkdir()
-    assert SharedWarmup(tmp_path / "fourth", warmups, SHA256, 7, 2).take()
+    assert one_that_takes(tmp_path / "fourth", warmups).take()
 
 
 def test_one_killed_while_it_replaces_a_damaged_one_leaves_none(tmp_path, caplog, monkeypatch):
@@ -194,8 +143,7 @@ def test_one_killed_while_it_replaces_a_damaged_one_leaves_none(tmp_path, caplog
         during.setattr(resume, "copy_file", killed)
         with pytest.raises(SystemExit):
             give(warmups, started(tmp_path / "second"))
-    (tmp_path / "third").mkdir()
-    third = SharedWarmup(tmp_path / "third", warmups, SHA256, 7, 2)
+    third = one_that_takes(tmp_path / "third", warmups)
     assert not third.take()
     assert "is damaged" not in caplog.text
     give(warmups, started(tmp_path / "fourth"))
@@ -208,8 +156,7 @@ def test_where_one_may_not_write_one_may_take(tmp_path, monkeypatch):
     (where,) = warmups.iterdir()
     (where / ".lock").unlink()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != where)
-    (tmp_path / "second").mkdir()
-    assert SharedWarmup(tmp_path / "second", warmups, SHA256, 7, 2).take()
+    assert one_that_takes(tmp_path / "second", warmups).take()
     assert not (where / ".lock").exists()
 
 
@@ -222,33 +169,23 @@ def test_the_hash_covers_what_comes_before():
         "evaluation": {"turns": 4},
         "experiment_name": "a",
     }
-    started = {"data": {"source": {"sha256": "a"}, "target": 1}, "versions": {"a": 1, "b": 2}}
-    started |= {"threads": 1, "files": {}}
+    begun = {"data": {"source": "a"}, "versions": {"a": 1, "b": 2}, "threads": 1, "files": {}}
 
-    def of(key="", value=None, started=started):
+    def of(key="", value=None, **more):
         cfg = OmegaConf.create(plain)
         if key:
             OmegaConf.update(cfg, key, value)
-        return warmup_sha256(cfg, started)
+        return warmup_sha256(cfg, begun | more)
 
     for key, value in (
-        ("paths.scratch", "b"),
-        ("selection.student", "best"),
-        ("selftraining.rounds", 4),
-        ("evaluation", None),
-        ("experiment_name", "b"),
+        *(("paths.scratch", "b"), ("selection.student", "best"), ("selftraining.rounds", 4)),
+        *(("evaluation", None), ("experiment_name", "b")),
     ):
         assert of(key, value) == of(), key
-    turned = {"versions": {"b": 2, "a": 1}, "data": {"target": 1, "source": {"sha256": "a"}}}
-    assert of(started={**started, **turned}) == of()
-    others = [
-        of("model.k", 10),
-        of("selection.teacher", "best"),
-        of(started={**started, "threads": 2}),
-        of(started={**started, "versions": {"a": 1, "b": 3}}),
-        of(started={**started, "data": {"source": {"sha256": "b"}, "target": 1}}),
-    ]
-    assert len({of(), *others}) == 6
+    assert of(versions={"b": 2, "a": 1}) == of()
+    others = [of("model.k", 10), of("selection.teacher", "best"), of(threads=2)]
+    others += [of(versions={"a": 1, "b": 3}), of(data={"source": "b"}), of(files={"a": "b"})]
+    assert len({of(), *others}) == 7
 
 
 @pytest.mark.parametrize(
@@ -297,29 +234,18 @@ def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
     assert all(torch.equal(weights[name], again[name]) for name in weights)
 
 
-@pytest.mark.slow
-def test_a_flipped_bit_is_trained_again(toy, tmp_path, caplog):
-    train(toy("selftraining=none"))
-    (folder,) = shared_folders(tmp_path)
-    sha256 = json.loads((folder / "started.json").read_text())["warmup_sha256"]
-
-    def take(name: str) -> bool:
-        return SharedWarmup(tmp_path / name, folder.parent, sha256, 0, 2).take()
-
-    assert take("whole")
+def test_a_flipped_bit_is_no_warm_up(tmp_path, caplog):
+    warmups = tmp_path / "warmups"
+    give(warmups, started(tmp_path / "first"))
+    (where,) = warmups.iterdir()
     for name in ("history.csv", "last.ckpt"):
-        whole = (folder / name).read_bytes()
-        (folder / name).write_bytes(flipped(whole))
+        whole = (where / name).read_bytes()
+        (where / name).write_bytes(flipped(whole))
         caplog.clear()
-        assert not take(name)
-        assert f"the warm-up in {folder} is damaged: it is trained again" in caplog.text
-        (folder / name).write_bytes(whole)
-    (folder / "last.ckpt").write_bytes(flipped(whole))
-    caplog.clear()
-    other = toy("selftraining=none", "experiment_name=other")
-    assert train(other).final == read_metrics(hashing.run_folder(toy("selftraining=none"))).final
-    assert not taken(caplog)
-    assert take("repaired")
+        assert not one_that_takes(tmp_path / name, warmups).take()
+        assert f"the warm-up in {where} is damaged: it is trained again" in caplog.text
+        (where / name).write_bytes(whole)
+    assert one_that_takes(tmp_path / "whole", warmups).take()
 
 
 def test_what_cannot_be_written_is_a_warning(toy, tmp_path, caplog):
