@@ -13,14 +13,7 @@ from qs3.utils.pool import Pool
 def pool_of(engine: str, workers: int, settings: Sequence[str], folder: Path) -> Pool:
     """The pool of `conf/engine/<engine>.yaml`, for commands that Hydra does not compose.
 
-    Args:
-        engine: its name.
-        workers: processes of this machine.
-        settings: such as "engine.address=auto".
-        folder: where an engine may keep its own files.
-
-    Raises:
-        ConfigError: no such engine or setting.
+    `settings`: such as "engine.address=auto"; `folder`: where an engine may keep its own files.
     """
     words = (f"+engine={engine}", f"+workers={workers}", override("+paths.data_dir", folder))
     pool: Pool = build(composed(None, *words, *settings, place=f"engine={engine}: ").engine)

@@ -64,39 +64,32 @@ class Clock(Callback):
 
     def __init__(self, began: Moment) -> None:
         self.began = began
-        self.before = Moment(0.0, 0.0)
-        self.peaks = {"memory": 0, "gpu": 0}
+        self.before = {"seconds": 0.0, "core_seconds": 0.0, "memory": 0, "gpu": 0}
         if torch.cuda.is_available():
             torch.cuda.reset_peak_memory_stats()
 
     def taken(self) -> Times:
         """What the run has taken so far."""
-        now, peaks = self._so_far(), self._peaks()
+        found = self.state_dict()
         return Times(
-            seconds=round(now.wall, 1),
-            core_seconds=round(now.cores, 1),
-            memory_gb=round(peaks["memory"] / 1e9, 3) or None,
-            gpu_memory_gb=round(peaks["gpu"] / 1e9, 3) or None,
+            seconds=round(found["seconds"], 1),
+            core_seconds=round(found["core_seconds"], 1),
+            memory_gb=round(found["memory"] / 1e9, 3) or None,
+            gpu_memory_gb=round(found["gpu"] / 1e9, 3) or None,
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Seconds and bytes so far."""
-        now = self._so_far()
-        return {"seconds": now.wall, "core_seconds": now.cores, "peaks": self._peaks()}
+        """Seconds so far, and bytes at most, in the process and on its GPU."""
+        gpu = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
+        memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        cores = max(0.0, processor_seconds() - self.began.cores)
+        return {
+            "seconds": self.before["seconds"] + time.time() - self.began.wall,
+            "core_seconds": self.before["core_seconds"] + cores,
+            "memory": max(self.before["memory"], memory),
+            "gpu": max(self.before["gpu"], gpu),
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take over what earlier starts took."""
-        self.before = Moment(state_dict["seconds"], state_dict["core_seconds"])
-        self.peaks |= state_dict["peaks"]
-
-    def _so_far(self) -> Moment:
-        """Wall and processor time in seconds."""
-        cores = max(0.0, processor_seconds() - self.began.cores)
-        return Moment(self.before.wall + time.time() - self.began.wall, self.before.cores + cores)
-
-    def _peaks(self) -> dict[str, int]:
-        """Bytes at most, in the process and on its GPU; 0 for what is not known."""
-        gpu = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
-        kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        now = {"memory": 1024 * kib, "gpu": gpu}
-        return {name: max(peak, self.peaks[name]) for name, peak in now.items()}
+        self.before = state_dict

@@ -130,18 +130,23 @@ class Classifier(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep it until there is a plateau: optimisers are made later."""
+        # Lightning converts to `trainer.precision` after it has loaded: float64 would be rounded.
+        weights = checkpoint["state_dict"].values()
+        self.to(next(value.dtype for value in weights if value.is_floating_point()))
         self._loaded_plateau = checkpoint.get("plateau")
 
     def on_train_start(self) -> None:
         """Make graphs where passes are on one GPU; a frozen backbone's go through the host."""
-        on_one_gpu = self.device.type == "cuda" and self.trainer.world_size == 1
         if (
             self.cuda_graphs
-            and on_one_gpu
+            and self._is_on_one_gpu()
             and isinstance(self.net, PointClassifier)
             and any(p.requires_grad for p in self.net.backbone.parameters())
         ):
             self._graphs = Graphs(self.net)
+
+    def _is_on_one_gpu(self) -> bool:
+        return self.device.type == "cuda" and self.trainer.world_size == 1
 
     def on_train_end(self) -> None:
         """Graphs keep memory."""

@@ -7,6 +7,7 @@ the objective of each instead of accuracies, and refuses beforehand to vary how 
 from __future__ import annotations
 
 import atexit
+import concurrent.futures.thread  # noqa: F401  pandas needs it, too late at exit: see `_summarise`
 import json
 import logging
 import os
@@ -36,9 +37,7 @@ class SummaryOfSeeds(Callback):
 
     Jobs may run in other processes and on other machines (joblib, submitit), so what becomes of
     them is noted in a file next to the runs; its name travels to the jobs inside this object.
-
-    Args:
-        table: whether finished runs are summarised; a search has a table of its own.
+    `table`: whether finished runs are summarised; a search has a table of its own.
     """
 
     def __init__(self, table: bool = True) -> None:

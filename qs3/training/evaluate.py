@@ -262,15 +262,9 @@ def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
 def without_labels(
     table: Float[np.ndarray, "n c"], choice: StudentSelection | None
 ) -> dict[str, float | None]:
-    """The reported net's scores by `qs3.evaluation.validators`, on the target's training clouds.
+    """The reported net's label-free scores on the target's training clouds, and `pseudo_val`'s.
 
-    Args:
-        table: what it says of them.
-        choice: how it was chosen: if by `pseudo_val`, that score is here, too.
-
-    Returns:
-        Scores by name; None for one that is not a number, of a net that has diverged. SND needs two
-        clouds.
+    None for one that is not a number, of a net that has diverged. SND needs two clouds.
     """
     scores = {
         name: one.score(table)

@@ -69,21 +69,14 @@ def checkpoint_asked_for(run: Run) -> Path | None:
 def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
     """Do what `ckpt_path` asks for, before training begins.
 
-    null does nothing. "last" insists on a checkpoint of the run. A path, of a run's folder or of
-    the `last.ckpt` in it, brings the same run from elsewhere: another machine's logs, a backup. A
-    run that has a checkpoint of its own goes on from that.
-
-    Args:
-        run: whose folder it is.
-        started: what the run is started with, as in `started.json`.
-
-    Returns:
-        What it was begun with, there or here.
+    "last" insists on a checkpoint of the run. A path, of a run's folder or of the `last.ckpt` in
+    it, brings the same run from elsewhere: another machine's logs, a backup. A run that has a
+    checkpoint of its own goes on from that. Takes and returns what `started.json` says, there or
+    here.
 
     Raises:
-        MissingDataError: there is no such checkpoint.
-        ConfigError, DataError: it is another run's, was trained on other data, or is damaged.
-        Qs3Error: it is still being trained.
+        MissingDataError, ConfigError, DataError: there is no such checkpoint, or it is another
+            run's, of other data, damaged, or still being trained.
     """
     path = checkpoint_asked_for(run)
     if path is None:

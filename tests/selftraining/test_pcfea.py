@@ -126,19 +126,6 @@ def test_a_pool_by_hand() -> None:
         torch.testing.assert_close(method.source_mean[k], of_class.mean(0), rtol=1e-4, atol=1e-5)
 
 
-def test_a_class_without_a_cloud_in_the_pool_keeps_the_source_s_mean() -> None:
-    net, data = tiny_net(), _data(8)
-    method = Pcfea()
-    method.prepare(net)
-    method.start_epoch(net, data, 95, 100)  # the last pool: no source cloud is left of two a class
-    with torch.no_grad():
-        named = penultimate(net.eval(), data.target.points)[1].argmax(1)
-    empty = torch.bincount(named, minlength=CLASSES) == 0
-    assert empty.any()
-    assert method.source_mean.any(dim=1).all()
-    assert torch.equal((method.mean == method.source_mean).all(dim=1), empty)
-
-
 def test_terms_before_and_with_a_pool() -> None:
     net, data = tiny_net(norm=False), _data()
     method = Pcfea(align_weight=2.0)
@@ -174,11 +161,3 @@ def test_plain_epochs_by_hand(plain, epochs, first):
 def test_an_epoch_must_be_left_for_a_pool(plain, epochs):
     with pytest.raises(ConfigError):
         plain_epochs(plain, epochs)
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"shift": "half"}, {"pool": "all"}, {"rank": "first"}, {"momentum": 1.0}]
-)
-def test_wrong_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Pcfea(**wrong)

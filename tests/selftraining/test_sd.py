@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -100,14 +98,6 @@ def test_each_class_has_at_least_one_that_is_sure() -> None:
     assert sorted(found.labels[sure]) == [0, 1, 2]
 
 
-def test_defaults_are_those_of_the_config() -> None:
-    path = Path(__file__).parents[2] / "conf" / "selftraining" / "sd.yaml"
-    written = yaml.safe_load(path.read_text())["selector"]
-    del written["_target_"]
-    own = dataclasses.asdict(GraphRefined())
-    assert own == {**written, "seed": 0}
-
-
 def test_the_order_of_the_rows_and_torch_s_generator_do_not_matter() -> None:
     teacher, _ = _two_groups(wrong=0.25)
     selector, order = GraphRefined(growth=0.4, steps=10), np.random.default_rng(1).permutation(60)
@@ -121,9 +111,3 @@ def test_the_order_of_the_rows_and_torch_s_generator_do_not_matter() -> None:
     np.testing.assert_array_equal(selector.select(mixed, 0.0, 1).soft, here.soft[order])
     other = dataclasses.replace(selector, seed=1, steps=1).select(teacher, 0.0, 1)
     assert not np.array_equal(other.soft, here.soft)
-
-
-@pytest.mark.parametrize("wrong", [{"growth": 0.0}, {"unsure": 0.0}, {"correlation": 1.0}])
-def test_settings_out_of_their_range_are_refused(wrong) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        GraphRefined(**wrong)

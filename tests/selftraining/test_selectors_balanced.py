@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from fractions import Fraction
 
 import numpy as np
@@ -46,15 +45,6 @@ def test_cbst_worked_by_hand() -> None:
     assert selection.kept.tolist() == [2, 1, 0]
     assert selection.confident.tolist() == [4, 3, 1]
     assert selection.mu.tolist() == [0.5] * 3
-
-
-def test_cbst_at_ties() -> None:
-    # predicted 0: .9 four times, .8, .52, .5 (a tie of classes: the lowest): rank 3, theta_0 = .9.
-    # predicted 1: .55 alone: rank 0, theta_1 = 1.
-    table = [[0.9, 0.1], [0.8, 0.2], [0.5, 0.5], [0.45, 0.55], [0.52, 0.48], *[[0.9, 0.1]] * 3]
-    selection, kept = select(Cbst(portion=0.5), table)
-    assert selection.thresholds.tolist() == [0.9, 1.0]
-    assert kept == "a0 f0 g0 h0"  # four for a rank of three
 
 
 def test_cbst_overrules_the_most_probable_class() -> None:
@@ -142,20 +132,6 @@ def test_spst_keeps_every_confident_sample(p, theta) -> None:
     selection, kept = select(Spst(), p, theta, ids)
     assert selection.selected.tolist() == (p.max(axis=1) > theta).tolist()
     assert kept == select(Qbst(mu="one"), p, theta, ids)[1]
-
-
-@given(probabilities, st.sampled_from([0.2, 0.35, 0.5, 1.0]))
-def test_cbst_keeps_at_least_its_portion_of_each_class(p, portion) -> None:
-    """At least floor(portion n_k) of the samples predicted k are >= theta_k."""
-    selection, _ = select(Cbst(portion=portion, most=1.0), p)
-    predicted = p.argmax(axis=1)
-    for k in range(4):
-        of_class = p[predicted == k, k]
-        rank = math.floor(portion * len(of_class) + 1e-9)
-        assert (of_class >= selection.thresholds[k]).sum() >= rank
-        assert (of_class > selection.thresholds[k]).sum() <= max(rank - 1, 0)
-    quotient = p / selection.thresholds
-    assert selection.selected.tolist() == (quotient.max(axis=1) >= 1).tolist()
 
 
 @given(probabilities)

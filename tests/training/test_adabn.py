@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from qs3.config import hashing
@@ -11,7 +10,6 @@ from qs3.evaluation.norms import adapt_norms
 from qs3.runs.checkpoints import load
 from qs3.store.store import open_pointset
 from qs3.training.command import train
-from qs3.training.evaluate import ADAPTERS
 from tests.training.toy import TinyNet, write_domain
 
 
@@ -42,15 +40,6 @@ def test_the_net_is_asked_as_it_was_trained(toy, tmp_path):
     adapted = train(toy(*changes, "evaluation.norms=adabn")).quality
     assert plain.expected is not None
     assert adapted.expected == plain.expected
-
-
-@pytest.mark.parametrize("norms", ADAPTERS)
-def test_two_target_clouds_are_enough(toy, tmp_path, norms):
-    write_domain(tmp_path / "few", "specklenet10", noise=0.05, train=4, test=2)
-    write_domain(tmp_path / "few", "kinectsim10", noise=0.15, train=(1, 1, 0), test=2)
-    words = ("method=source_only", "selftraining=none", f"paths.data_dir={tmp_path / 'few'}")
-    metrics = train(toy(*words, "protocol.epochs=1", f"evaluation.norms={norms}"))
-    assert metrics.evaluation.norms == norms
 
 
 def test_order_of_clouds_is_mixed_and_batches_are_even():

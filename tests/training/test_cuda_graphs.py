@@ -10,7 +10,6 @@ import torch
 from qs3.config import hashing
 from qs3.engine import cuda_graphs
 from qs3.engine.classifier import Classifier
-from qs3.engine.cuda_graphs import captured
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from qs3.training.run import STUDENT
@@ -30,7 +29,7 @@ def test_a_run_is_the_same_with_graphs(
     monkeypatch.setattr(Played, "made", 0)
     monkeypatch.setattr(cuda_graphs, "EAGER", 1)
     monkeypatch.setattr(cuda_graphs, "captured", Played)
-    monkeypatch.setattr(Classifier, "_takes_graphs", lambda self: True)
+    monkeypatch.setattr(Classifier, "_is_on_one_gpu", lambda self: True)
     graphed = _weights(config)
     assert Played.made >= 2  # in the rounds other ones than in the warm-up; two domains' passes
     assert plain.keys() == graphed.keys()
@@ -46,20 +45,3 @@ def _weights(config: Any) -> dict[str, torch.Tensor]:
     """Of the last student."""
     train(config)
     return load(hashing.run_folder(config) / STUDENT)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_a_gpu_s_run_is_the_same_with_graphs(toy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = []
-
-    def counted(*args: Any) -> Any:
-        made.append(args)
-        return captured(*args)
-
-    monkeypatch.setattr(cuda_graphs, "captured", counted)
-    settings = (*POINTNET, "method=pcm", "force=true", "trainer=gpu", "protocol.batch_size=4")
-    one = _weights(toy(*settings, "trainer.cuda_graphs=false"))
-    assert not made
-    other = _weights(toy(*settings))
-    assert made
-    assert all(torch.equal(one[key], other[key]) for key in one)

@@ -10,18 +10,9 @@ import pytest
 
 from qs3.config import hashing
 from qs3.errors import DataError, MissingDataError
-from qs3.runs.metrics import TrainingAccuracy
 from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.watching import interrupt
-
-
-@pytest.mark.slow
-def test_overfit_learns_a_few_clouds_by_heart(toy):
-    cfg = toy("debug=overfit", "protocol.epochs=100", "selftraining.rounds=0")
-    metrics = train(cfg)
-    assert metrics.training == TrainingAccuracy(n=12, accuracy=1.0)  # four of each class
-    assert metrics.selftraining == "none"
 
 
 def test_a_run_of_few_clouds_leaves_no_cache(toy, tmp_path):

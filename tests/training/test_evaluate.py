@@ -6,11 +6,9 @@ import math
 from collections import Counter
 
 import pytest
-import torch
 
 from qs3.config import hashing
 from qs3.evaluation.metrics import predict, predict_rotated
-from qs3.runs.checkpoints import weights_sha256
 from qs3.runs.predictions import FILE, read_predictions
 from qs3.training import evaluate as stage
 from qs3.training.command import train
@@ -55,25 +53,3 @@ def test_equal_weights_predict_equal_clouds_once(toy, passes, more, nets, rotate
     predictions = read_predictions(folder / FILE)
     right = (predictions.predicted == predictions.labels).mean()
     assert metrics.final.accuracy == pytest.approx(right)
-
-
-def test_weights_are_equal_by_their_values_and_names():
-    weights = {"w": torch.zeros(2, 3)}
-    sha = weights_sha256(weights)
-    assert weights_sha256({"w": torch.zeros(2, 3)}) == sha
-    assert weights_sha256({"w": torch.full((2, 3), 1e-45)}) != sha
-    assert weights_sha256({"w": torch.zeros(3, 2)}) != sha
-    assert weights_sha256({"v": torch.zeros(2, 3)}) != sha
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_evaluation_of_a_gpus_training_is_on_the_gpu(toy, monkeypatch):
-    devices = set()
-
-    def spied(net, points, batch_size, device="cpu", **named):
-        devices.add(torch.device(device).type)
-        return predict(net, points, batch_size, device, **named)
-
-    monkeypatch.setattr(stage, "predict", spied)
-    train(toy("force=true", "trainer=gpu"))
-    assert devices == {"cuda"}

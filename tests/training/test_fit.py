@@ -184,23 +184,3 @@ def test_other_settings_of_the_same_name_and_changed_data_are_refused(toy, place
     (folder / "metrics.json").unlink()
     with pytest.raises(error):
         train(cfg)
-
-
-def test_leftovers_of_a_kill_are_removed(toy):
-    cfg = toy("selftraining.rounds=1", "protocol.epochs=1", "selftraining.epochs=1")
-    folder = hashing.run_folder(cfg)
-    leftovers = [folder / ".last.ckpt.x.tmp.ckpt", folder / "round_00" / ".p.csv.x.tmp.csv"]
-    for path in leftovers:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("")
-    train(cfg)
-    assert not any(path.exists() for path in leftovers)
-
-
-def test_damaged_checkpoint(toy, tmp_path):
-    cfg = toy()
-    folder = hashing.run_folder(cfg)
-    folder.mkdir(parents=True)
-    (folder / "last.ckpt").write_bytes(b"not a checkpoint")
-    with pytest.raises(DataError, match=r"last\.ckpt"):
-        train(cfg)

@@ -11,7 +11,6 @@ from qs3.inference.model_file import read_result, write_result
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
-from tests.training.conftest import result_of
 from tests.training.watching import interrupt
 
 ONLY_ROUNDS = ("selection.teacher=given", "protocol.epochs=1", "selftraining.init=continue")
@@ -64,17 +63,6 @@ def test_a_run_does_not_go_on_with_another_classifier(toy, finished, tmp_path):
     with pytest.raises(DataError, match="weights="):
         train(toy("selftraining=none", "protocol.epochs=3", f"weights={teacher}",
                   f"ckpt_path={moved}", "paths.warmup_dir=null"))  # fmt: skip
-
-
-def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
-    words = (*ONLY_ROUNDS, f"weights={finished}")
-    whole = toy(*words)
-    train(whole)
-    again = toy(*words, f"paths.log_dir={tmp_path / 'again'}")
-    for epoch in (0, 1, 3):
-        interrupt(again, epoch=epoch)
-    train(again)
-    assert result_of(hashing.run_folder(again)) == result_of(hashing.run_folder(whole))
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import RunMetrics
 from qs3.runs.predictions import read_pseudo_labels
-from qs3.selftraining.callback import SelfTraining
 from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.utils.seeding import derive
@@ -123,17 +122,6 @@ def test_a_persistent_student_is_new_in_round_0_and_kept_afterwards(persistent: 
 
 
 @pytest.mark.parametrize("name", ["scratch", "continued"])
-def test_the_schedule_begins_anew(name: str, request: pytest.FixtureRequest) -> None:
-    run: Kept = request.getfixturevalue(name)
-    rates = [run.before(epoch)["rates"][0] for epoch in range(10)]
-    for start, end in zip(STARTS, ENDS, strict=True):
-        assert rates[start] == 0.02
-        phase = rates[start : end + 1]
-        assert phase == sorted(phase, reverse=True)
-        assert len(set(phase)) == len(phase)
-
-
-@pytest.mark.parametrize("name", ["scratch", "continued"])
 def test_checkpoints_hold_what_was_trained(name: str, request: pytest.FixtureRequest) -> None:
     """At the end of a phase, too: steps of its own in the optimiser, trained weights."""
     run: Kept = request.getfixturevalue(name)
@@ -172,23 +160,3 @@ def test_each_round_is_labelled_by_its_teacher(name: str, request: pytest.Fixtur
         table = [(row.id, row.label, row.confidence) for row in read_pseudo_labels(file)]
         assert table == table_by(run, teacher)
         assert table != table_by(run, run.net(ENDS[0]))
-
-
-def test_labelling_leaves_the_model_alone(toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = 0
-
-    def select(self: Any, trainer: Any, module: Any, *args: Any, real=SelfTraining._select, **more):
-        nonlocal seen
-        seen += 1
-        before = {k: v.clone() for k, v in module.state_dict().items()}
-        moments = {id(p): len(s) for p, s in trainer.optimizers[0].state.items()}
-        training, state = module.training, torch.get_rng_state()
-        real(self, trainer, module, *args, **more)
-        assert same(before, module.state_dict())
-        assert moments == {id(p): len(s) for p, s in trainer.optimizers[0].state.items()}
-        assert module.training == training
-        assert torch.equal(state, torch.get_rng_state())
-
-    monkeypatch.setattr(SelfTraining, "_select", select)
-    train(toy())
-    assert seen == 2

@@ -10,7 +10,7 @@ import pytest
 import qs3
 from qs3.config import hashing
 from qs3.errors import ConfigError
-from qs3.evaluation.prior import estimate_shares, read_prior
+from qs3.evaluation.prior import read_prior
 from qs3.inference.model_file import read_result
 from qs3.runs.metrics import read_metrics
 from qs3.runs.predictions import read_predictions
@@ -91,27 +91,6 @@ def test_a_student_has_met_its_pseudo_labels(toy, uneven: Path) -> None:
     counts = np.array([metrics.rounds[-1].selected[name] for name in CLASSES]) + 1.0
     both = (counts / counts.sum() + np.array([33, 17, 9]) / 59) / 2
     assert read_result(hashing.run_folder(cfg)).learnt == pytest.approx(both)
-
-
-def test_shares_are_estimated_without_a_label(toy, uneven: Path) -> None:
-    """From the target's training clouds, by the reported net; the test clouds take no part."""
-    words = (f"paths.data_dir={uneven}", *WORDS)
-    plain = toy(*words)
-    told = toy(*words, "evaluation.prior=estimated", "evaluation.prior_power=0.25")
-    before, after = train(plain), train(told)
-    of_plain, of_told = (
-        read_predictions(hashing.run_folder(cfg) / "predictions.csv") for cfg in (plain, told)
-    )
-    clouds = open_pointset(uneven / "kinectsim10").split("train").points
-    answers = qs3.load(hashing.run_folder(plain), packages=PACKAGES)(list(np.array(clouds)))
-    learnt = np.array([33, 17, 9]) / 59
-    shares = estimate_shares(answers, learnt)
-    prior = read_prior(dict(zip(CLASSES, shares, strict=True)), CLASSES, learnt, power=0.25)
-    expected = prior(of_plain.probabilities)
-    np.testing.assert_allclose(of_told.probabilities, expected, atol=1e-5)
-    assert after.evaluation.prior == prior.words
-    assert after.quality == before.quality
-    assert after.validators == before.validators
 
 
 @pytest.mark.parametrize("words", ["rooms", "{unicorn: 2}", "{rod: -1}"])

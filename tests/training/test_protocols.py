@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 import torch
 from torch.nn import functional as F
@@ -11,13 +9,14 @@ from torch.nn import functional as F
 from qs3.config import hashing
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
+from qs3.evaluation.metrics import global_features, predict
 from qs3.methods.base import class_loss
 from qs3.methods.bounds import SourceOnly
 from qs3.models.pointnet import pointnet, transform_regulariser
+from qs3.runs.checkpoints import load
 from qs3.selftraining.student_selection import Student
 from qs3.training.command import train
-from tests.training.conftest import result_of
-from tests.training.watching import interrupt
+from tests.training.nets import featured
 
 
 def test_smoothing_spreads_over_the_other_classes():
@@ -28,28 +27,6 @@ def test_smoothing_spreads_over_the_other_classes():
     torch.testing.assert_close(class_loss(logits, labels, 0.2), by_hand)
     torch.testing.assert_close(class_loss(logits, F.one_hot(labels, 4).double(), 0.2), by_hand)
     torch.testing.assert_close(class_loss(logits, labels), F.cross_entropy(logits, labels))
-
-
-SIMPLEVIEW = ("protocol=simpleview", "protocol.epochs=40", "protocol.optimizer.lr=4.0")
-
-
-def column(folder, name) -> list[float]:
-    with open(folder / "history.csv", newline="") as file:
-        return [float(row[name]) for row in csv.DictReader(file)]
-
-
-@pytest.mark.slow
-def test_a_run_with_a_plateau_resumes_exactly(toy):
-    cfg = toy(*SIMPLEVIEW)
-    train(cfg)
-    rates, expected = column(hashing.run_folder(cfg), "lr"), result_of(hashing.run_folder(cfg))
-    assert rates[0] == 4.0
-    assert rates[39] < 4.0  # it came to a plateau
-    assert rates[40:] == [4.0] * 6  # each round begins anew
-    again = toy(*SIMPLEVIEW, "force=true")
-    interrupt(again, "on_train_batch_end", 78)  # in the warm-up
-    train(toy(*SIMPLEVIEW))
-    assert result_of(hashing.run_folder(cfg)) == expected
 
 
 def test_the_nets_regulariser_is_added():
@@ -74,3 +51,31 @@ def test_the_nets_regulariser_is_added():
     assert features.regulariser > 0
     assert plain > 0
     assert transform_regulariser(torch.eye(3)[None]) == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_clouds_are_of_the_type_of_the_weights(dtype):
+    net, points = featured(3).to(dtype), torch.randn(5, 16, 3)
+    with torch.no_grad():
+        logits = net.eval()(points.to(dtype)).double()
+        features = net.features(points.to(dtype)).global_.double()
+    torch.testing.assert_close(torch.from_numpy(predict(net, points, 5)), logits.softmax(1))
+    torch.testing.assert_close(torch.from_numpy(global_features(net, points, 5)), features)
+
+
+FEATURED = "model._target_=tests.training.nets.featured"
+# Each epoch 15 batches of 4 clouds of 60: its last step is of one batch.
+SETTINGS = (
+    *(FEATURED, "protocol.epochs=2", "protocol.batch_size=4", "selftraining=none"),
+    *("+trainer.accumulate_grad_batches=2", "paths.warmup_dir=null"),
+)
+
+
+def test_means_count_the_steps_of_the_optimiser(toy):
+    cfg = toy("method=sd", *SETTINGS)
+    train(cfg)
+    saved = load(hashing.run_folder(cfg) / "last.ckpt")
+    batches = saved["loops"]["fit_loop"]["epoch_loop.batch_progress"]["total"]["completed"]
+    assert batches % 4 == 2, "an epoch ends within a step"
+    assert saved["global_step"] == 2 * -(-batches // 4)
+    assert saved["state_dict"]["method.steps"] == saved["global_step"]

@@ -36,6 +36,9 @@ SCHEMES = {
     "confident": ("selftraining=confident",),
     "steps": ("selftraining=qbst", "protocol.steps=8", "selftraining.steps=5"),
     "continued_alone": ("selftraining=qbst", "selftraining.init=continue", "selftraining.pcm=true"),
+    "pseudo_val": ("selection.student=pseudo_val",),
+    "snd": ("selection.student=snd",),
+    "double": ("trainer.precision=64-true", "selection.student=infomax"),
 }
 METHODS = {
     "source_only": ("method=source_only",),
@@ -64,9 +67,11 @@ def check(toy: Any, tmp_path: Path, settings: tuple[str, ...], *epochs: int) -> 
     train(broken)
     ours, theirs = hashing.run_folder(broken), hashing.run_folder(whole)
     assert result_of(ours) == result_of(theirs)
-    for name in ("warmup_selected.pt", "student.pt"):
-        weights = load(theirs / name)
-        assert all(torch.equal(load(ours / name)[key], value) for key, value in weights.items())
+    files = [file for file in theirs.glob("*.pt") if file.name != "result.pt"]
+    assert len(files) >= 3
+    for file in files:
+        weights = load(file)
+        assert all(torch.equal(load(ours / file.name)[key], x) for key, x in weights.items())
     state = load(theirs / "last.ckpt")["state_dict"]  # the method's heads, too
     ours_state = load(ours / "last.ckpt")["state_dict"]
     assert all(torch.equal(ours_state[key], value) for key, value in state.items())
@@ -76,9 +81,25 @@ def fast_are(fast: set[str], names: dict[str, Any]) -> list[Any]:
     return [pytest.param(n, marks=[] if n in fast else pytest.mark.slow) for n in names]
 
 
-@pytest.mark.parametrize("name", fast_are({"qbst"}, SCHEMES))
+@pytest.mark.parametrize("name", fast_are({"qbst", "pseudo_val", "double"}, SCHEMES))
 def test_every_scheme_goes_on_in_the_middle_of_a_round(toy, tmp_path, name):
     check(toy, tmp_path, (*SHORT, *SCHEMES[name]), FIRST, LAST)
+
+
+@pytest.mark.slow
+def test_a_plateau_goes_on(toy, tmp_path):
+    """In its warm-up; each round begins anew."""
+    words = ("protocol=simpleview", "protocol.epochs=40", "protocol.optimizer.lr=4.0")
+    check(toy, tmp_path, words, 20)
+    rows = (tmp_path / "whole").glob("*/*/history.csv").__next__().read_text().splitlines()
+    rates = [float(row.split(",")[2]) for row in rows[1:]]
+    assert rates[0] == 4.0 > rates[39]
+    assert rates[40:] == [4.0] * 6
+
+
+def test_a_given_teacher_goes_on(toy, tmp_path, finished):
+    words = ("selection.teacher=given", "protocol.epochs=1", "selftraining.init=continue")
+    check(toy, tmp_path, (*words, f"weights={finished}"), 1, 3)
 
 
 @pytest.mark.parametrize("name", fast_are({"gast"}, METHODS))

@@ -27,7 +27,6 @@ from qs3.store.store import open_pointset
 from qs3.training.command import headline, train
 from tests.training.conftest import result_of
 from tests.training.toy import CLASSES, toy_config
-from tests.training.watching import interrupt
 
 RULES = STUDENT_RULES[1:]
 LAST_ROUND = range(7, 10)  # epochs; 0 to 3 are the warm-up, 4 to 6 round 0
@@ -88,9 +87,6 @@ def table_of(cfg: Any, weights: Path, data: Path, rows: Any = slice(None)) -> np
     return predict(net, points[rows], 64)
 
 
-# --- what is chosen ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rule", LABEL_FREE)
 def test_a_rule_without_held_out_clouds_only_looks(by_rule, finished, rule):
     ours, theirs = result_of(by_rule(rule)), result_of(finished)
@@ -134,29 +130,6 @@ def test_scores_are_those_of_each_epoch_on_the_targets_training_clouds(
     chosen = folder / "student_selected.pt"
     assert same_weights(chosen, epoch_file(folder, student.epoch))
     assert same_weights(folder / "result.pt", chosen)
-
-
-def test_another_epoch_than_the_last_is_reported(toy, monkeypatch):
-    """The score is made to fall, so that the first epoch of the round is the best."""
-    first: dict[str, torch.Tensor] = {}
-
-    def falling(self, net, data, classifier):
-        if classifier.current_epoch == LAST_ROUND[0]:
-            first.update(copy_weights(net))
-        return -float(classifier.current_epoch)
-
-    monkeypatch.setattr(StudentSelection, "_score", falling)
-    cfg = toy("selection.student=snd")
-    metrics = train(cfg)
-    folder = hashing.run_folder(cfg)
-    assert metrics.student.epoch == LAST_ROUND[0]
-    for file in ("student_selected.pt", "result.pt"):
-        found = weights_of(folder / file)
-        assert all(torch.equal(found[name], first[name]) for name in first)
-    assert not same_weights(folder / "student.pt", folder / "student_selected.pt")
-
-
-# --- held-out pseudo-labels --------------------------------------------------------------------
 
 
 def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
@@ -222,26 +195,3 @@ def test_each_process_has_two_to_train_on(tmp_path):
     assert len(callback.held_out[0]) == 1
     with pytest.raises(SelectionError, match="pseudo_val"):
         callback._hold_out(data, processes=4)
-
-
-# --- interruptions -----------------------------------------------------------------------------
-
-
-PLACES = [
-    ("on_train_epoch_end", 7),  # selected, held out, but not yet in a checkpoint
-    ("on_train_epoch_start", 8),  # between the last selection and the last round
-    ("on_train_epoch_start", 10),  # two epochs of the last round are scored
-    ("on_train_epoch_end", 10),
-    ("on_train_end", 1),
-]
-
-
-@pytest.mark.parametrize(("hook", "count"), PLACES)
-def test_interrupted_in_a_hook(by_rule, toy, hook, count):
-    rule = "pseudo_val" if count in (7, 8) else "snd"
-    cfg = toy(f"selection.student={rule}")
-    interrupt(cfg, hook, count)
-    train(cfg)
-    folder = hashing.run_folder(cfg)
-    assert result_of(folder) == result_of(by_rule(rule))
-    assert same_weights(folder / "result.pt", by_rule(rule) / "result.pt")

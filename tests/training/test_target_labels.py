@@ -5,12 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from qs3.datamodules.splits import RULES
 from qs3.engine.classifier import Classifier
@@ -154,47 +152,3 @@ def test_the_upper_bound_does_hold_them(toy, tmp_path, watch):
     which = {path.split(": ")[-1] for path in watch.found}
     assert which == {"train labels, lineage t", "train labels, lineage v"}
     assert watch.keys == {"points", "y_target_train"}
-
-
-# --- the search finds labels in whatever they are hidden ---------------------------------------
-
-LABELS = np.random.default_rng(0).integers(3, size=50)
-
-
-def generator() -> Any:
-    hidden = LABELS.tolist()
-    yield lambda: hidden
-
-
-class Slotted:
-    __slots__ = ("hidden",)
-
-    def __init__(self) -> None:
-        self.hidden = tuple(LABELS.tolist())
-
-
-HIDDEN = {
-    "float tensor": lambda: torch.tensor(LABELS).float(),
-    "one-hot": lambda: torch.nn.functional.one_hot(torch.tensor(LABELS)),
-    "by id": lambda: {f"id{i}": int(y) for i, y in enumerate(LABELS)},
-    "as folders": lambda: tuple(f"{'abc'[y]}/train/{i}" for i, y in enumerate(LABELS)),
-    "view": lambda: torch.tensor(LABELS)[:4],
-    "array's view": lambda: LABELS.copy()[3:5],
-    "part of more": lambda: np.concatenate([np.zeros(9, int), LABELS, np.ones(3, int)]),
-    "closure": lambda: next(generator()),
-    "slot": Slotted,
-    "iterator": lambda: iter([LABELS.copy()]),
-}
-
-
-@pytest.mark.parametrize("how", HIDDEN)
-def test_the_search_finds(how):
-    thing = SimpleNamespace(deep=[{"a": HIDDEN[how]()}])
-    assert search({"thing": thing}, Truth({"labels": LABELS}))
-
-
-def test_the_search_finds_nothing_where_there_is_nothing():
-    rng = np.random.default_rng(1)
-    others = [rng.integers(3, size=50), rng.random((50, 3)), list(range(50)), "a" * 50, None]
-    thing = SimpleNamespace(deep=[others, torch.zeros(50), lambda: others])
-    assert search({"thing": thing}, Truth({"labels": LABELS})) == []

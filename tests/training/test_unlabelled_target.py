@@ -86,14 +86,3 @@ def test_without_a_test_split_predictions_of_the_training_clouds_are_counted(
     assert metrics.final.n == 72
     assert "has no labels for a test" in caplog.text
     assert metrics.rounds[0].with_target_labels is not None  # they judge pseudo-labels alone
-
-
-def test_labels_of_some_classes_only(toy, toy_data, tmp_path):
-    """As ScanObjectNN has seven of the ten: the others are left out of the balanced accuracy."""
-    data = only(toy_data, tmp_path / "cut", lambda row: row.cls != "rod")
-    metrics = train(toy(f"paths.data_dir={data}", "selftraining=none"))
-    final = metrics.final
-    recall = final.per_class_recall
-    assert recall["rod"] is None
-    assert final.balanced_accuracy == pytest.approx((recall["ball"] + recall["slab"]) / 2)
-    assert final.n == 16
