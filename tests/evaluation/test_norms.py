@@ -1,4 +1,4 @@
-"""TENT: entropy by hand, a step by hand, what it leaves alone, and what it gains over AdaBN."""
+"""TENT: entropy by hand, a step by hand, and what it leaves alone."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ import math
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from qs3.evaluation.norms import RATE, adapt_norms, entropy, minimise_entropy
 from qs3.kernels.norms import use_domain
-from qs3.methods.bounds import SourceOnly
 from qs3.models.base import ClassHead, PointClassifier
 from qs3.models.dgcnn import DGCNN
-from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, train
-from tests.methods.test_learning import POINTS, strays
+from tests.methods.shapes import tiny_net
 
 
 def test_entropy_known_answers() -> None:
@@ -84,33 +82,3 @@ def test_a_step_by_hand() -> None:
 
 def _is_norm(module: nn.Module) -> bool:
     return isinstance(module, nn.BatchNorm1d)
-
-
-@pytest.mark.slow
-def test_tent_gains_over_adabn_on_strays() -> None:
-    """A tenth of the points anywhere: 1.4 points over three seeds with 1,024 clouds, 64 steps.
-
-    On noise 0.5; on a stretch and a warp AdaBN leaves little to gain; on a tilt, where half of the
-    predictions are wrong, it lost 1 to gained 6.
-    """
-    gains: list[float] = []
-    for seed in range(3):
-        generator = torch.Generator().manual_seed(seed)
-
-        def clouds(labels: Tensor, generator: torch.Generator = generator) -> Tensor:
-            return boxes(labels, POINTS, generator)
-
-        labels = torch.arange(256) % CLASSES
-        source, net = clouds(labels), tiny_net(seed)
-        schedule = {"steps": 150, "seed": seed, "batch_size": 16}
-        train(SourceOnly(), net, (source, labels), source, **schedule)
-        of_target, held_out = (
-            torch.randint(CLASSES, (n,), generator=generator) for n in (1024, 512)
-        )
-        target, test = (strays(clouds(y), generator) for y in (of_target, held_out))
-        plain = copy.deepcopy(net)
-        minimise_entropy(net, target, 16, seed=0)
-        adapt_norms(plain, target, 16, seed=0)
-        gains.append(accuracy(net, test, held_out) - accuracy(plain, test, held_out))
-    assert sum(gains) / 3 > 0.005, gains
-    assert min(gains) >= 0.0, gains

@@ -1,4 +1,4 @@
-"""Errors that are taken out of depth again, and the table that asks what they are worth."""
+"""Errors that are taken out of depth again."""
 
 from dataclasses import replace
 
@@ -82,6 +82,3 @@ def test_what_stays_is_the_same_to_the_bit():
         assert (frame.depth_m != plain.depth_m)[np.isfinite(frame.depth_m)].any() or (
             np.isnan(frame.depth_m) & np.isfinite(plain.depth_m)
         ).any()
-
-
-# --- the table that asks what they are worth

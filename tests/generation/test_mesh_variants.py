@@ -25,26 +25,8 @@ def stool():
     return trimesh.util.concatenate(parts)
 
 
-def as_off(change=lambda s: s):
-    def write(solid, path):
-        s = change(solid.copy())
-        lines = [f"OFF\n{len(s.vertices)} {len(s.faces)} 0"]
-        lines += [" ".join(f"{x:.9g}" for x in v) for v in s.vertices]
-        lines += [f"3 {a} {b} {c}" for a, b, c in s.faces]
-        path.with_suffix(".off").write_text("\n".join(lines) + "\n")
-
-    return write
-
-
 def faces_changed(change):
-    def apply(solid):
-        return trimesh.Trimesh(solid.vertices, change(solid.faces), process=False)
-
-    return as_off(apply)
-
-
-def scaled(factor):
-    return as_off(lambda s: s.apply_scale(factor))
+    return lambda solid: trimesh.Trimesh(solid.vertices, change(solid.faces), process=False)
 
 
 def with_fin(solid):
@@ -57,33 +39,32 @@ def with_fin(solid):
     )
 
 
+def soup(solid):
+    corners = solid.vertices[solid.faces].reshape(-1, 3)
+    return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+
+
 SAME = {  # what must give the same cloud as the plain OFF
-    "millimetres": scaled(1000.0),
+    "millimetres": lambda solid: solid.apply_scale(1000.0),
     "inverted": faces_changed(lambda f: f[:, ::-1]),
     "duplicate_faces": faces_changed(lambda f: np.concatenate([f, f[::-1]])),
     "degenerate_faces": faces_changed(lambda f: np.concatenate([f, f[:9, [0, 0, 1]]])),
-    "soup_without_normals": as_off(
-        lambda s: trimesh.Trimesh(
-            s.vertices[s.faces].reshape(-1, 3),
-            np.arange(3 * len(s.faces)).reshape(-1, 3),
-            process=False,
-        )
-    ),
-    "non_manifold": as_off(with_fin),
+    "soup_without_normals": soup,
+    "non_manifold": with_fin,
 }
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
     root = tmp_path_factory.mktemp("plain")
-    return scan(root, as_off())
+    return scan(root, lambda solid: solid)
 
 
-def scan(root, write, *overrides):
+def scan(root, change):
     folder = root / "meshes" / "chair" / "train"
     folder.mkdir(parents=True)
-    write(stool(), folder / "stool")
-    generate(config(root, root / "meshes", "classes=[chair]", "workers=0", *overrides))
+    change(stool()).export(folder / "stool.off", digits=9)
+    generate(config(root, root / "meshes", "classes=[chair]", "workers=0"))
     noisy = open_pointset(root / "specklenet10")
     assert noisy.ids == ("chair/train/stool",)
     return noisy.points[0], open_pointset(root / "specklenet10", "points_clean").points[0]
