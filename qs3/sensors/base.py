@@ -288,10 +288,7 @@ class TriangulatingSensor(DepthSensor):
         for post in self.filters:
             before = np.isfinite(disparity)
             disparity = post.apply(disparity)
-            dropped = before & ~np.isfinite(disparity)
-            filled = ~before & np.isfinite(disparity)
-            reason = np.where(dropped, np.uint8(Reason.FILTERED), reason)
-            reason = np.where(filled, np.uint8(Reason.OK), reason)
+            reason = np.where(before & ~np.isfinite(disparity), np.uint8(Reason.FILTERED), reason)
         disparity = self.quantiser.apply(disparity)
         scale = self.focal_px * self.baseline_m
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -8,12 +8,7 @@ import pytest
 import torch
 
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.gradients import (
-    Twin,
-    correlations,
-    pair_of,
-    settings_of,
-)
+from qs3.sensors.gradients import Twin, pair_of, settings_of
 from qs3.sensors.matching import StereoBlockMatcher
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
@@ -143,19 +138,3 @@ def test_the_variance_of_speckle_grows_with_the_square_of_its_contrast(pair):
     assert float(relative.detach()) == pytest.approx(0.09, rel=0.01)
     relative.backward()
     assert float(contrast.grad) == pytest.approx(2 * 0.3, rel=0.01)
-
-
-@pytest.mark.parametrize("offset", [0, 7, -5])
-def test_correlation_at_whole_disparities_is_that_of_the_blocks(offset):
-    rng = np.random.default_rng(offset + 10)
-    left, right = rng.random((20, 40)), rng.random((20, 60))
-    low, high, block = 2, 6, 5
-    found = correlations(torch.from_numpy(left), torch.from_numpy(right), offset, low, high, block)
-    assert found.shape == (4 * (high - low) + 1, 20, 40)
-    for d in range(low, high + 1):
-        for row, column in ((9, 15), (4, 20), (15, 25)):
-            parts = [left[row - 2 : row + 3, column - 2 : column + 3]]
-            at = column + offset - d
-            parts.append(right[row - 2 : row + 3, at - 2 : at + 3])
-            expected = np.corrcoef(*(part.ravel() for part in parts))[0, 1]
-            assert float(found[4 * (d - low), row, column]) == pytest.approx(expected, abs=1e-4)

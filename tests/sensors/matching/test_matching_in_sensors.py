@@ -1,12 +1,8 @@
 """Every matcher in every sensor that matches, through the real renderer; and their configs."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from qs3.config.compose import composed
-from qs3.config.hydra import build
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.matching import (
@@ -63,11 +59,3 @@ def test_planes_of_a_sensor_with_a_stored_pattern_come_back(renderer, name):
     pooled = np.concatenate(list(depth_errors(sensor, renderer, np.linspace(1.95, 2.05, 8), 0.2)))
     assert abs(np.median(pooled)) < 0.04
     assert np.quantile(np.abs(pooled), 0.68) < 0.15
-
-
-@pytest.mark.parametrize("name", ["census", "stereo_bm"])
-def test_every_matcher_is_a_choice_and_its_file_shows_all_it_has(name):
-    cfg = composed(None, "+sensor=speckle_stereo", f"sensor/matcher={name}")
-    matcher = build(cfg.sensor).matcher
-    fields = {field.name for field in dataclasses.fields(matcher)}
-    assert set(cfg.sensor.matcher) - {"_target_"} == fields
