@@ -98,7 +98,7 @@ def test_02_qbst():
 @pytest.mark.slow
 def test_03_results():
     done = run("03_results", FOLDER)
-    assert len(images(done)) == 3
+    assert images(done)  # the curves
     text = printed(done)
     assert "4 runs, 0 still missing" in text
     assert "minus mu = 1" in text

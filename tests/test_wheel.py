@@ -81,7 +81,7 @@ def test_everything_works_in_an_empty_folder(installed, tmp_path):
 
     cell = " ".join(word for word in run if "make" not in word)  # it is made now
     (tmp_path / "mine.yaml").write_text(TABLE.format(run=cell))
-    assert "1 run to do" in qs3("qs3", "report", "train", "table=mine.yaml", "seeds=0,1")
+    assert "1 runs to do" in qs3("qs3", "report", "train", "table=mine.yaml", "seeds=0,1")
     assert "source only" in qs3("qs3", "report", "table=mine.yaml")
     qs3("qs3", "predict", f"ckpt={folder}", "input=data/modelnet10/points.npy", "threads=1")
     assert len((tmp_path / "predictions.csv").read_text().splitlines()) == 31

@@ -62,7 +62,7 @@ def config_sha256(cfg: DictConfig) -> str:
         _leave_out(plain, key)
     plain.setdefault("callbacks", {})  # ~callbacks leaves nothing out
     plain = _with_values(plain, cfg, "", _FROM_OUTSIDE)
-    if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
+    if _without_rounds(plain.get("selftraining")):  # its other settings are not read
         plain["selftraining"] = None
         plain = _with_values(plain, cfg, "", _from(["selftraining"]))
     trainer = plain.get("trainer")

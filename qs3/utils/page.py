@@ -1,4 +1,4 @@
-"""Pages and texts from the templates beside this module; a page has everything inside."""
+"""Pages and texts from the templates next to this module; a page has everything inside."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def unit(values: np.ndarray) -> np.ndarray:
 
 
 def turn_deg(cloud: Float[np.ndarray, "p 3"]) -> float:
-    """Degrees to turn the viewer by: what lies beside the origin is first seen from there.
+    """Degrees to turn the viewer by: what lies next to the origin is first seen from there.
 
     That is where a scan has its camera; what lies around the origin is seen as in all pictures.
     """
