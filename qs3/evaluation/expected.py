@@ -49,7 +49,7 @@ class HeldOut:
 def held_out(
     probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray, " v"]
 ) -> HeldOut | None:
-    """From a net's answers to held-out labelled clouds; None if it has diverged."""
+    """What a net's answers to held-out labelled clouds say; None if it has diverged."""
     if not np.isfinite(probabilities).all():
         return None
     right = int((probabilities.argmax(axis=1) == labels).sum())
@@ -78,14 +78,10 @@ def in_words(expected: float | None) -> str:
 def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray, " v"]) -> float:
     """The T in [0.05, 20] for which softmax(log p / T) has the least cross-entropy to the labels.
 
-    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, section 4.2. T > 1 makes less
-    sure; no class changes. A label counts (v + 1) / (v + 2), the other classes share the rest
-    (Laplace's rule of succession, as in Platt, "Probabilistic Outputs for Support Vector Machines",
-    1999, section 2.2): a net that makes no error on v clouds is not taken to make none at all.
-
-    Args:
-        probabilities: of held-out clouds, v >= 1.
-        labels: theirs.
+    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, section 4.2. A label counts
+    (v + 1) / (v + 2), the other classes share the rest (Laplace's rule of succession, as in Platt,
+    "Probabilistic Outputs for Support Vector Machines", 1999, section 2.2): a net that makes no
+    error on v >= 1 clouds is not taken to make none at all.
     """
     classes = probabilities.shape[1]
     rest = 1 / (len(labels) + 2)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,19 +46,13 @@ def global_features(
     *,
     domain: str = "target",
 ) -> Float[np.ndarray, "n d"]:
-    """The backbone's features of each cloud, float64: as `said_of`.
-
-    Raises:
-        ConfigError: the model is not a backbone with a head.
-    """
+    """The backbone's features of each cloud, float64, as `said_of`."""
     if not hasattr(net, "features"):
         raise ConfigError(f"{type(net).__name__} has no features; choose e.g. model=dgcnn")
-
-    def of_batch(x: Tensor) -> tuple[Tensor]:
-        return (net.features(x).global_,)
-
-    (features,) = said_of(net, of_batch, points, batch_size, device, domain=domain)
-    return features.numpy()
+    features = said_of(
+        net, lambda x: (net.features(x).global_,), points, batch_size, device, domain=domain
+    )
+    return features[0].numpy()
 
 
 @torch.no_grad()
@@ -112,47 +105,6 @@ def rotation_average(
     return total / rotations
 
 
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """Confidence against accuracy in bins ((b-1)/B, b/B] of the largest probability.
-
-    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, figure 1 and eq. 1 to 3.
-
-    Attributes:
-        count: [B] clouds in each bin.
-        confidence: [B] their mean largest probability; NaN in an empty bin.
-        accuracy: [B] the share that is right; NaN likewise.
-        error: expected calibration error in [0, 1].
-    """
-
-    count: Int[np.ndarray, " b"]
-    confidence: Float[np.ndarray, " b"]
-    accuracy: Float[np.ndarray, " b"]
-    error: float
-
-
-def reliability(
-    probabilities: Float[np.ndarray, "n c"],
-    labels: Int[np.ndarray, " n"],
-    bins: int = CALIBRATION_BINS,
-) -> Reliability | None:
-    """The diagram's figures; None if no cloud has a label. Clouds without one (-1) are left out."""
-    known = labels >= 0
-    if not known.any():
-        return None
-    probabilities, labels = probabilities[known], labels[known]
-    confidence, right = probabilities.max(axis=1), probabilities.argmax(axis=1) == labels
-    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
-    count = np.bincount(place, minlength=bins)
-    some = np.where(count, count, 1)
-    means = [
-        np.where(count, np.bincount(place, weights=w, minlength=bins) / some, np.nan)
-        for w in (confidence, right)
-    ]
-    gap = np.bincount(place, weights=right - confidence, minlength=bins)  # n_b (accuracy - conf.)
-    return Reliability(count, means[0], means[1], float(np.abs(gap).sum() / len(labels)))
-
-
 def calibration_error(
     probabilities: Float[np.ndarray, "n c"],
     labels: Int[np.ndarray, " n"],
@@ -163,9 +115,10 @@ def calibration_error(
     ECE = Σ_b n_b / n |accuracy_b - confidence_b| over bins of equal width, ((b-1)/B, b/B], of the
     largest probability (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, eq. 3).
     """
-    found = reliability(probabilities, labels, bins)
-    assert found is not None
-    return found.error
+    confidence, right = probabilities.max(axis=1), probabilities.argmax(axis=1) == labels
+    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    gap = np.bincount(place, weights=right - confidence, minlength=bins)  # n_b (accuracy - conf.)
+    return float(np.abs(gap).sum() / len(labels))
 
 
 def scores(
@@ -204,7 +157,7 @@ class Evaluation:
 
     Args:
         test: the target's test clouds.
-        labels: theirs [n]; None if nobody knows them.
+        labels: theirs [n]; None if they are not known.
         train_labels: of its training clouds by id, which only judge pseudo-labels; None likewise.
         classes: names in label order.
         rotations: over how many rotations `rotation_averaged` averages; 0 leaves it out.
@@ -230,7 +183,7 @@ class Evaluation:
 
     @property
     def labelled(self) -> bool:
-        """Whether anybody knows the classes of the evaluated clouds."""
+        """Whether the classes of the evaluated clouds are known."""
         return self.y_target_eval is not None
 
     def predictions_of(self, probabilities: Float[np.ndarray, "n c"]) -> Predictions:
@@ -262,11 +215,7 @@ class Evaluation:
     def rotation_averaged(
         self, of_turn: Callable[[float], Float[np.ndarray, "n c"]]
     ) -> Scores | None:
-        """The same for probabilities averaged over turns; None if that was not asked for.
-
-        Args:
-            of_turn: the test clouds' after a rotation about the up axis, by an angle in radians.
-        """
+        """Scores of the mean over turns by `of_turn` (radians); None if `rotations` is 0."""
         if not self.rotations:
             return None
         return self.scores_of(rotation_average(of_turn, self.rotations))
@@ -280,14 +229,12 @@ class Evaluation:
         if self._train is None:
             return None
         rows = read_pseudo_labels(path)
-        if odd := next((row.id for row in rows if row.id not in self._train), ""):
-            raise DataError(
-                f"{path} is damaged (no cloud is called {odd!r}); repeat the run with force=true"
-            )
-        right = np.array([self.classes[self._train[row.id]] == row.label for row in rows])
-        kept = np.array([row.selected for row in rows])
+        truth = rows.id.map(self._train)
+        if truth.isna().any():
+            raise DataError(f"{path} is damaged (it has other clouds); use force=true")
+        right = np.array(self.classes)[truth.astype(int)] == rows.label
         return PseudoLabelScores(
-            precision=float(right[kept].mean()),
-            recall=float((right & kept).mean()),
+            precision=float(right[rows.selected].mean()),
+            recall=float((right & rows.selected).mean()),
             accuracy=float(right.mean()),
         )

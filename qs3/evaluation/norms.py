@@ -30,17 +30,14 @@ def adapt_norms(
     """AdaBN: give the net's batch norms the statistics of the target's training clouds (n >= 2).
 
     Li et al., "Revisiting Batch Normalization For Practical Domain Adaptation", ICLR Workshop 2017.
-
-    One pass in random order (a dataset is sorted by class, and a batch should look like the
-    whole), in batches of about `batch_size`, as equal as they can be. The weights stay. `kept`: the
-    share of the statistics of training in the new ones, above 0 for alpha-BN.
+    `kept`: the share of the statistics of training in the new ones, above 0 for alpha-BN.
     """
-    batches = even_batches(points, batch_size, seed)
     with use_trained(net, "target"):
+        batches = _even_batches(points, batch_size, seed)
         adapt_batchnorm(net, (batch.to(device) for batch in batches), kept)
 
 
-def even_batches(
+def _even_batches(
     points: Float[Tensor, "n p 3"], batch_size: int, seed: int
 ) -> Iterator[Float[Tensor, "b p 3"]]:
     """All clouds in random order, in batches of about `batch_size`, as equal as they can be.
@@ -70,11 +67,8 @@ def minimise_entropy(
 
     Wang et al., "Tent: Fully Test-Time Adaptation by Entropy Minimization", ICLR 2021. In batches
     as `adapt_norms` has them, each a step on its mean entropy, normalised by its own statistics.
-    There the paper predicts, too; here the test clouds come later, one by one if need be, so
-    statistics of all training clouds are left behind.
-
-    Raises:
-        ConfigError: the net has no batch norm.
+    There the paper predicts, too; here the test clouds come later, so statistics of all training
+    clouds are left behind.
     """
     parameters, modes = list(net.parameters()), {m: m.training for m in net.modules()}
     wanted = [p.requires_grad for p in parameters]
@@ -88,7 +82,7 @@ def minimise_entropy(
                 norm.training = True
             affine = [p.requires_grad_() for norm in norms for p in norm.parameters()]
             optimizer = torch.optim.Adam(affine, RATE)
-            for batch in even_batches(points, batch_size, seed):
+            for batch in _even_batches(points, batch_size, seed):
                 optimizer.zero_grad()
                 entropy(net(batch.to(device))).backward()
                 optimizer.step()

@@ -39,6 +39,19 @@ _MOST = 1000  # clouds that are measured of a domain; 3 ms each
 _LOOKED_AT = 300  # of a domain, for a share
 
 
+def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
+    """The `MEASURES` of a cloud in its sample number 0, and those that its scale adds."""
+    row = clouds.rows[index]
+    stored = np.asarray(clouds.stored[row])
+    sample = clouds.in_unit_ball().take(torch.tensor([index]))[0].numpy()
+    found = measure(stored, sample)
+    if clouds.scale != "unit_ball":
+        found["size"] = float(clouds.radius[row])
+    if clouds.scale == "above_floor":
+        found["base"] = float(stored[:, 2].min() - clouds.floor)
+    return found
+
+
 def measure(stored: Float[np.ndarray, "p 3"], sample: Float[np.ndarray, "m 3"]) -> dict[str, float]:
     """The `MEASURES` of a cloud.
 
@@ -54,25 +67,14 @@ def measure(stored: Float[np.ndarray, "p 3"], sample: Float[np.ndarray, "m 3"]) 
     spread = np.cov(moved.T, bias=True).astype(np.float64)
     along = np.sqrt(np.linalg.eigvalsh(spread).clip(min=0))  # ascending
     level = np.sqrt((spread[0, 0] + spread[1, 1]) / 2)
+    rows = np.ascontiguousarray(stored, dtype=np.float32) + np.float32(0)  # -0 is 0
     return {
-        "points": float(_different(stored)),
+        "points": float(len(set(rows.view("V12").ravel().tolist()))),
         "spacing": spacing,
         "middle": float(np.median(np.linalg.norm(sample, axis=1))),
         "thickness": float(along[0] / along[2]) if along[2] > 0 else 0.0,
         "height": float(min(np.sqrt(spread[2, 2]) / max(level, 1e-9), 1e3)),
     }
-
-
-def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
-    """The `MEASURES` of a cloud in its sample number 0, and those that its scale adds."""
-    row = clouds.rows[index]
-    sample = clouds.in_unit_ball().take(torch.tensor([index]))[0].numpy()
-    found = measure(np.asarray(clouds.stored[row]), sample)
-    if clouds.scale != "unit_ball":
-        found["size"] = float(clouds.radius[row])
-    if clouds.scale == "above_floor":
-        found["base"] = float(np.asarray(clouds.stored[row])[:, 2].min() - clouds.floor)
-    return found
 
 
 def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
@@ -101,11 +103,7 @@ def source_limits(source: Clouds, most: int = _MOST) -> dict[str, list[float]]:
 
 
 def relax_min_points(usual: Mapping[str, list[float]], seen: int) -> dict[str, list[float]]:
-    """The same ranges for a net that sees `seen` points of a cloud.
-
-    A cloud that has as many points as the net sees does not lack any, however many the clouds of
-    training have on disk.
-    """
+    """The same ranges; a cloud with the `seen` points that a net takes does not lack any."""
     changed = {name: list(ends) for name, ends in usual.items()}
     if "points" in changed:
         changed["points"][0] = min(changed["points"][0], float(seen))
@@ -131,26 +129,18 @@ def other_units(reasons: Iterable[str]) -> str:
     return f"{count} are too large for metres: their answers mean nothing" if count else ""
 
 
-def ood_reasons_of_all(
-    clouds: Clouds, usual: Mapping[str, list[float]], most: int | None = None
-) -> list[list[str]]:
-    """`ood_reasons` of each cloud, or of at most `most`, evenly spaced."""
-    found = _measured(clouds, len(clouds) if most is None else most)
-    return [ood_reasons(each, usual) for each in found]
+def ood_reasons_of_all(clouds: Clouds, usual: Mapping[str, list[float]]) -> list[list[str]]:
+    """`ood_reasons` of each cloud."""
+    return [ood_reasons(each, usual) for each in _measured(clouds, len(clouds))]
 
 
 def ood_share(clouds: Clouds, source: Clouds) -> float:
     """The share of clouds outside the usual range of the source's, by at most 300 of each."""
-    found = ood_reasons_of_all(clouds, source_limits(source, _LOOKED_AT), most=_LOOKED_AT)
-    return sum(map(bool, found)) / len(found)
+    usual, found = source_limits(source, _LOOKED_AT), _measured(clouds, _LOOKED_AT)
+    return sum(bool(ood_reasons(each, usual)) for each in found) / len(found)
 
 
 def _measured(clouds: Clouds, most: int) -> list[dict[str, float]]:
     """The measures of at most `most` clouds, evenly spaced."""
     chosen = np.unique(np.linspace(0, len(clouds) - 1, min(len(clouds), most)).astype(int))
     return [measure_one(clouds, int(i)) for i in chosen]
-
-
-def _different(points: Float[np.ndarray, "p 3"]) -> int:
-    rows = np.ascontiguousarray(points, dtype=np.float32) + np.float32(0)  # -0 is 0
-    return len(set(rows.view("V12").ravel().tolist()))

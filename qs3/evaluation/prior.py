@@ -94,10 +94,21 @@ def read_prior(
         power: t >= 0.
 
     Raises:
-        ConfigError: what is given is no such thing, or names a class that the net does not know.
+        ConfigError: what is given is not a prior, or names a class that the net does not know.
     """
+    common: dict[str, float] = {}
     try:
-        common = _common(given, classes)
+        if given == "rooms":
+            given = {name: ROOMS[name] for name in classes}
+        elif isinstance(given, str):
+            pairs = (part.rsplit(":", 1) for part in given.strip().strip("{}").split(","))
+            given = {name: float(x) for name, x in pairs}
+        assert not isinstance(given, str)
+        for word, value in given.items():
+            name = known_as(str(word).strip().strip("\"'"), classes)
+            if name is None or name in common:
+                raise ValueError(f"{word} is not a class, or named twice")
+            common[name] = float(value)
         here = np.array([common.get(name, 1.0) for name in classes], dtype=np.float64)
         if not (power >= 0 and np.isfinite(here).all() and here.min() >= 0 and here.any()):
             raise ValueError("needs numbers from 0 on, one of them above 0")
@@ -122,23 +133,6 @@ def shares_of(labels: Int[np.ndarray, " n"] | Sequence[int], classes: int) -> np
     return counts / counts.sum()
 
 
-def _common(given: str | Mapping[str, float], classes: Sequence[str]) -> dict[str, float]:
-    """How common each named class is, in any unit; a KeyError or ValueError names what is wrong."""
-    if given == "rooms":
-        return {name: float(ROOMS[name]) for name in classes}
-    if isinstance(given, str):
-        words = given.strip().removeprefix("{").removesuffix("}")
-        given = {name: float(x) for name, x in (part.rsplit(":", 1) for part in words.split(","))}
-    assert not isinstance(given, str)
-    found: dict[str, float] = {}
-    for word, value in given.items():
-        name = known_as(str(word).strip().strip("\"'"), classes)
-        if name is None or name in found:
-            raise ValueError(f"{word} is not a class, or named twice")
-        found[name] = float(value)
-    return found
-
-
 def estimate_shares(
     probabilities: Float[np.ndarray, "n c"],
     learnt: Float[np.ndarray, " c"],
@@ -156,13 +150,11 @@ def estimate_shares(
     that is never predicted from being impossible (a Dirichlet prior).
 
     Args:
-        probabilities: p, n >= 0. Clouds with a NaN, of a net that diverged, are left out.
+        probabilities: p, n >= 0. Clouds with a NaN, of a net that diverged, are left out; without
+            any, q is u.
         learnt: u, each above 0, of sum 1.
         temperature: T > 0.
         more: m >= 0.
-
-    Returns:
-        [c] q >= 0, of sum 1, each above 0 with `more`. `learnt` where no cloud is left.
     """
     known = probabilities[np.isfinite(probabilities).all(axis=1)]
     if not len(known):

@@ -17,8 +17,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,10 +26,6 @@ from qs3.errors import ConfigError
 
 LAST = "last"
 PSEUDO_VAL = "pseudo_val"
-OBJECTIVES = ("entropy", "infomax", "snd")
-"""What a search may look at: no label of the target, and the same clouds in each trial."""
-
-STUDENT_RULES = (LAST, PSEUDO_VAL, *OBJECTIVES)
 
 TEMPERATURE = 0.05
 """Temperature of the soft neighbourhood density, as in its paper and code."""
@@ -80,7 +75,7 @@ def snd(
     Neighborhood Density", ICCV 2021 (arXiv 2108.10860), there with τ = 0.05 as well.
 
     Args:
-        probabilities: rows that sum to 1, n >= 2.
+        probabilities: rows that sum to 1.
         temperature: τ > 0.
         block: rows of the similarities that are in memory at once.
     """
@@ -100,8 +95,7 @@ def snd(
     return float(np.clip(total / n, 0.0, math.log(n - 1)))
 
 
-@dataclass(frozen=True)
-class Validator:
+class Validator(NamedTuple):
     """A score without labels, and which way is better."""
 
     score: Callable[[Float[np.ndarray, "n k"]], float]
@@ -113,6 +107,9 @@ LABEL_FREE: Mapping[str, Validator] = {
     "infomax": Validator(infomax, higher_is_better=True),
     "snd": Validator(snd, higher_is_better=True),
 }
+"""What a search may look at: no label of the target, and the same clouds in each trial."""
+
+STUDENT_RULES = (LAST, PSEUDO_VAL, *LABEL_FREE)
 
 
 def is_better(rule: str, score: float, best: float | None) -> bool:
@@ -135,8 +132,7 @@ def hold_out(
 
     Of m_k clouds m_k / 5 to the nearest whole number, so a class with one or two of them keeps
     all. QS3's released code (train_QBST_sim2real.py, lines 312 to 315) takes positions 8 and 9 of
-    every ten in a list sorted by class and confidence: a fifth of each class and of all
-    confidences alike, as here on average.
+    every ten in a list sorted by class and confidence.
 
     Args:
         labels: pseudo-labels.
@@ -160,23 +156,17 @@ def entropies(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"
 
 
 def chosen_in_words(chosen: str) -> str:
-    """`selection.teacher` or `.student` of metrics.json for people, who count epochs from 1.
-
-    "source_val, epoch 7" is "source_val, epoch 8", as the progress of a run counts.
-    """
+    """`selection.teacher` or `.student` of metrics.json for people, who count epochs from 1."""
     return re.sub(r"(?<=, epoch )\d+", lambda epoch: str(int(epoch[0]) + 1), chosen)
 
 
 def check_objective(objective: Any) -> None:
-    """Refuse what a search must not look at; None: there is no search.
+    """Raise ConfigError of what a search must not look at; None: there is no search.
 
     By `pseudo_val` each trial would be judged on clouds that it selected itself.
-
-    Raises:
-        ConfigError: it is not one of `OBJECTIVES`.
     """
-    if objective is not None and objective not in OBJECTIVES:
+    if objective is not None and objective not in LABEL_FREE:
         raise ConfigError(
             f"objective={objective}: a search may not look at the target's labels, nor at clouds "
-            f"that a trial chose; set objective={'|'.join(OBJECTIVES)}"
+            f"that a trial chose; set objective={'|'.join(LABEL_FREE)}"
         )

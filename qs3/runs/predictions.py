@@ -11,23 +11,22 @@ round_03/pseudo_labels.csv, of a round's target clouds: id, label, confidence, s
 from __future__ import annotations
 
 import contextlib
-import csv
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from qs3.errors import DataError
 from qs3.utils.files import write_text
-from qs3.utils.text_table import csv_text
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FILE = "predictions.csv"
 OF_FILES = "predictions_of_files.csv"
-_FIRST = ("id", "mesh", "label", "predicted")
-_TIER = "tier"
-_PSEUDO_LABELS = ("id", "label", "confidence", "selected")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,18 +49,6 @@ class Predictions:
     probabilities: Float[np.ndarray, "n c"]
     tiers: tuple[str, ...] = ()
 
-    def of(self, chosen: Bool[np.ndarray, " n"]) -> Predictions:
-        """Those of some clouds."""
-        where = np.flatnonzero(chosen)
-        return replace(
-            self,
-            ids=tuple(self.ids[i] for i in where),
-            meshes=tuple(self.meshes[i] for i in where),
-            labels=self.labels[where],
-            probabilities=self.probabilities[where],
-            tiers=tuple(self.tiers[i] for i in where) if self.tiers else (),
-        )
-
     @property
     def predicted(self) -> Int[np.ndarray, " n"]:
         """The most probable class of each, the first one on ties."""
@@ -70,15 +57,12 @@ class Predictions:
 
 def write_predictions(path: Path, predictions: Predictions) -> None:
     """Write the table, atomically; probabilities with all their digits."""
-    p = predictions
-    first = (*_FIRST, *([_TIER] if p.tiers else []))
-    lines: list[list[str]] = [[*first, *(f"p_{name}" for name in p.classes)]]
-    tiers = [[tier] for tier in p.tiers] or [[]] * len(p.ids)
-    rows = zip(p.ids, p.meshes, p.labels, p.predicted, tiers, p.probabilities, strict=True)
-    for id_, mesh, label, predicted, tier, row in rows:
-        name = "" if label < 0 else p.classes[label]
-        lines.append([id_, mesh, name, p.classes[predicted], *tier, *map(repr, row.tolist())])
-    write_text(path, csv_text(lines))
+    p, names = predictions, np.array([*predictions.classes, ""], dtype=object)
+    columns = {"id": p.ids, "mesh": p.meshes, "label": names[p.labels]}
+    columns |= {"predicted": names[p.predicted], **({"tier": p.tiers} if p.tiers else {})}
+    _write(
+        path, columns | {f"p_{c}": of for c, of in zip(p.classes, p.probabilities.T, strict=True)}
+    )
 
 
 def write_predictions_of_files(
@@ -89,14 +73,17 @@ def write_predictions_of_files(
     Columns: file; class; confidence; unlike_source (yes or no), reason (in what it is unlike the
     source's; "" if in nothing); and a probability per class, to four digits.
     """
-    p = predictions
-    first = ("file", "class", "confidence", "unlike_source", "reason")
-    lines: list[list[str]] = [[*first, *(f"p_{name}" for name in p.classes)]]
-    rows = zip(files, p.predicted, reasons, p.probabilities, strict=True)
-    for file, predicted, reason, row in sorted(rows, key=lambda r: r[0]):
-        flag, digits = "yes" if reason else "no", [f"{value:.4f}" for value in row]
-        lines.append([file, p.classes[predicted], digits[predicted], flag, reason, *digits])
-    write_text(path, csv_text(lines))
+    p, order = predictions, sorted(range(len(files)), key=files.__getitem__)
+    digits = np.array([[f"{value:.4f}" for value in row] for row in p.probabilities[order]])
+    called = p.predicted[order]
+    columns = {
+        "file": [files[i] for i in order],
+        "class": np.array(p.classes)[called],
+        "confidence": digits[np.arange(len(order)), called],
+        "unlike_source": ["yes" if reasons[i] else "no" for i in order],
+        "reason": [reasons[i] for i in order],
+    }
+    _write(path, columns | _chances(p.classes, digits))
 
 
 def read_predictions(path: Path) -> Predictions:
@@ -106,31 +93,21 @@ def read_predictions(path: Path) -> Predictions:
         DataError: it is not there, or damaged.
     """
     with _named(path):
-        header, rows = _read(path)
-        first = len(_FIRST) + (_TIER in header[: len(_FIRST) + 1])
-        classes = tuple(name.removeprefix("p_") for name in header[first:])
+        table = _read(path)
+        chances = table.filter(regex="^p_")
+        classes = tuple(name.removeprefix("p_") for name in chances)
         found = Predictions(
             classes,
-            tuple(row[0] for row in rows),
-            tuple(row[1] for row in rows),
-            np.array([classes.index(row[2]) if row[2] else -1 for row in rows]),
-            np.array([[float(cell) for cell in row[first:]] for row in rows]),
-            tuple(row[len(_FIRST)] for row in rows) if first > len(_FIRST) else (),
+            tuple(table.id),
+            tuple(table.mesh),
+            np.array([classes.index(label) if label else -1 for label in table.label]),
+            chances.to_numpy(dtype=float),
+            tuple(table.get("tier", ())),
         )
-        called = [classes.index(row[3]) for row in rows]
-        if called != found.predicted.tolist() or len({*found.ids}) < len(rows):
+        called = [classes.index(label) for label in table.predicted]
+        if called != found.predicted.tolist() or not table.id.is_unique:
             raise ValueError("an id occurs twice, or a class is not the most probable one")
         return found
-
-
-@dataclass(frozen=True)
-class PseudoLabel:
-    """One row: the predicted class's name and probability, and whether it is trained on."""
-
-    id: str
-    label: str
-    confidence: float
-    selected: bool
 
 
 def pseudo_labels_path(folder: Path, round_: int) -> Path:
@@ -147,22 +124,41 @@ def write_pseudo_labels(
     classes: Sequence[str],
 ) -> None:
     """Write the table, atomically; confidences with all their digits."""
-    rows = zip(ids, predicted, confidence, selected, strict=True)
-    lines = ([id_, classes[label], float(p), int(kept)] for id_, label, p, kept in rows)
-    write_text(path, csv_text([_PSEUDO_LABELS, *lines]))
+    columns = {"id": ids, "label": np.array([*classes])[predicted]}
+    kept = np.asarray(selected).astype(int)
+    _write(path, columns | {"confidence": np.asarray(confidence, dtype=float), "selected": kept})
 
 
-def read_pseudo_labels(path: Path) -> list[PseudoLabel]:
-    """Read the table.
+def read_pseudo_labels(path: Path) -> pd.DataFrame:
+    """Read the table: id, label (the predicted class's name), confidence, selected (a bool).
 
     Raises:
         DataError: it is not there, or damaged.
     """
     with _named(path):
-        return [
-            PseudoLabel(id_, label, float(confidence), {"0": False, "1": True}[selected])
-            for id_, label, confidence, selected in _read(path)[1]
-        ]
+        table = _read(path)
+        kept = [{"0": False, "1": True}[word] for word in table.selected]
+        return table.assign(confidence=table.confidence.astype(float), selected=kept)
+
+
+def _chances(classes: Sequence[str], table: np.ndarray) -> dict[str, np.ndarray]:
+    return {f"p_{name}": column for name, column in zip(classes, table.T, strict=True)}
+
+
+def _write(path: Path, columns: dict[str, Sequence[object]]) -> None:
+    import pandas as pd
+
+    write_text(path, pd.DataFrame(columns).to_csv(index=False, lineterminator="\n", na_rep="nan"))
+
+
+def _read(path: Path) -> pd.DataFrame:
+    """A table of words, of one row at least."""
+    import pandas as pd
+
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    if table.empty or table.isna().to_numpy().any():
+        raise ValueError("rows are missing, or have different lengths")
+    return table
 
 
 @contextlib.contextmanager
@@ -170,14 +166,5 @@ def _named(path: Path) -> Iterator[None]:
     """Turn what a damaged file raises into a DataError that names it."""
     try:
         yield
-    except (OSError, ValueError, KeyError, IndexError, csv.Error) as error:
+    except (OSError, ValueError, KeyError, IndexError, AttributeError) as error:
         raise DataError(f"{path} is damaged ({error}); repeat the run with force=true") from error
-
-
-def _read(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a CSV file, one at least, all of one length."""
-    with open(path, newline="", encoding="utf-8") as file:
-        header, first, *rows = csv.reader(file, strict=True)
-    if any(len(row) != len(header) for row in (first, *rows)):
-        raise ValueError("rows have different lengths")
-    return header, [first, *rows]

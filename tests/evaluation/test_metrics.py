@@ -14,11 +14,9 @@ from qs3.evaluation.metrics import (
     calibration_error,
     predict,
     predict_rotated,
-    reliability,
     rotation_average,
     scores,
 )
-from qs3.runs.metrics import Scores
 
 
 def test_scores_worked_by_hand():
@@ -35,40 +33,9 @@ def test_scores_worked_by_hand():
     assert result.calibration_error == pytest.approx(0.8 - 4 / 6)
 
 
-def test_without_labels_only_counts():
-    assert scores(np.eye(3)[[0, 2, 2]], None, ("a", "b", "c")) == Scores(
-        n=3, predicted={"a": 1, "b": 0, "c": 2}
-    )
-
-
 def test_a_net_that_has_diverged_has_scores_but_is_not_calibrated():
     result = scores(np.full((4, 2), np.nan), np.array([0, 0, 0, 1]), ("a", "b"))
     assert (result.accuracy, result.calibration_error) == (0.75, None)
-
-
-def test_calibration_worked_by_hand():
-    # bins of a half: (0, 1/2] holds two with confidence 0.5, one right; (1/2, 1] three
-    probabilities = np.array([[0.5, 0.5], [0.5, 0.5], [0.9, 0.1], [0.8, 0.2], [0.3, 0.7]])
-    labels = np.array([0, 1, 0, 1, 1])
-    expected = 2 / 5 * abs(1 / 2 - 0.5) + 3 / 5 * abs(2 / 3 - 0.8)
-    assert calibration_error(probabilities, labels, bins=2) == pytest.approx(expected)
-    sure = np.array([[1.0, 0.0], [1.0, 0.0]])
-    assert calibration_error(sure, np.array([0, 0])) == 0
-    assert calibration_error(sure, np.array([1, 1])) == 1
-
-
-def test_reliability_of_known_bins():
-    """Edges belong to the bin below; clouds without a label do not count."""
-    top = np.array([0.6, 0.6, 0.61, 1.0, 0.9])
-    table, labels = np.stack([top, 1 - top], axis=1), np.array([0, 1, 0, 0, -1])
-    found = reliability(table, labels, bins=5)
-    assert found.count.tolist() == [0, 0, 2, 1, 1]
-    np.testing.assert_allclose(found.accuracy[2:], [0.5, 1, 1])
-    np.testing.assert_allclose(found.confidence[2:], [0.6, 0.61, 1])
-    assert np.isnan(found.accuracy[:2]).all()
-    assert found.error == pytest.approx((2 * 0.1 + 0.39 + 0) / 4)
-    assert found.error == calibration_error(table[:4], labels[:4], bins=5)
-    assert reliability(table, np.full(5, -1)) is None
 
 
 @given(st.integers(0, 1000), st.integers(1, 30), st.integers(2, 5), st.integers(1, 20))

@@ -57,21 +57,6 @@ def test_what_is_no_number_stays_none() -> None:
     np.testing.assert_array_equal(np.isnan(said).all(axis=1), [True, False])
 
 
-def test_huge_numbers_and_powers_are_finite() -> None:
-    """The largest floats, and a power by which the commonest class alone is left."""
-    prior = read_prior(dict.fromkeys(THREE, 1.7e308), THREE, power=1.0)
-    np.testing.assert_allclose(list(prior.shares.values()), 1 / 3)
-    alone = read_prior("chair:2", THREE, power=1e300)
-    np.testing.assert_array_equal(alone(np.array([[0.01, 0.5, 0.49], [0, 0.5, 0.5]]))[0], [1, 0, 0])
-    assert np.isfinite(alone(np.array([[0, 0.5, 0.5]]))).all()
-
-
-def test_names_are_those_that_folders_may_have() -> None:
-    given = read_prior("Night_Stand:2,couch:3", CLASSES)
-    plain = read_prior({"cabinet": 2, "sofa": 3}, CLASSES)
-    np.testing.assert_array_equal(given.factors, plain.factors)
-
-
 @settings(max_examples=50, deadline=None)
 @given(shares, shares, st.floats(0.1, 10), st.floats(0, 2))
 def test_shares_whatever_the_unit_and_no_more(
@@ -158,16 +143,6 @@ def test_no_other_shares_are_likelier(temperature: float, more: float) -> None:
     assert all(objective(q, said, learnt, temperature, more) <= best for q in others)
     nudged = found + np.array([1e-4, -1e-4, 0])
     assert objective(nudged, said, learnt, temperature, more) < best
-
-
-def test_one_cloud_by_hand() -> None:
-    """q_0 = (r + m) / (1 + 2 m) with r = 4 q_0 / (4 q_0 + q_1), here m = 1."""
-    (first, second) = estimate_shares(
-        np.array([[0.8, 0.2]]), np.array([0.5, 0.5]), temperature=1.0, more=1.0
-    )
-    right = 4 * first / (4 * first + second)
-    assert first == pytest.approx((right + 1) / 3, abs=1e-6)
-    assert first + second == pytest.approx(1)
 
 
 def test_a_class_that_is_never_said_stays_possible() -> None:

@@ -44,9 +44,6 @@ def snd_of_all(p, temperature=0.05):
     return sum(values) / len(values)
 
 
-# --- by hand -----------------------------------------------------------------------------------
-
-
 def test_entropy_by_hand():
     assert entropy(CERTAIN) == 0
     assert entropy(UNSURE) == pytest.approx(math.log(3))
@@ -82,19 +79,6 @@ def test_snd_by_hand():
     )
 
 
-def test_snd_looks_at_directions():
-    """(0.9, 0.1) and (0.1, 0.9) are at cosine 0.18 / 0.82, whatever their lengths."""
-    table = np.array([[0.9, 0.1], [0.9, 0.1], [0.1, 0.9]])
-    cosine = 0.18 / 0.82
-    e = np.array([1.0, math.exp((cosine - 1) / 0.05)])
-    p = e / e.sum()
-    first = -(p * np.log(p)).sum()
-    assert snd(table) == pytest.approx((2 * first + math.log(2)) / 3)
-
-
-# --- twin and properties -----------------------------------------------------------------------
-
-
 @given(tables(), st.integers(1, 50))
 def test_snd_in_blocks_is_snd_of_all(table, block):
     assert snd(table, block=block) == pytest.approx(snd_of_all(table), abs=1e-9)
@@ -119,26 +103,6 @@ def test_ranges(table):
     assert 0 <= snd(table) <= math.log(n - 1)
 
 
-@given(tables())
-def test_what_is_known_of_the_class_is_not_more_than_its_entropy(table):
-    mean = table.mean(axis=0, keepdims=True)
-    assert infomax(table) + entropy(table) == pytest.approx(entropy(mean), abs=1e-9)
-
-
-def test_many_clouds_do_not_need_all_similarities_at_once():
-    import tracemalloc
-
-    table = np.random.default_rng(0).dirichlet(np.ones(10), size=4000)
-    tracemalloc.start()
-    snd(table, block=64)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 4000 * 4000 * 8 / 8  # all of them are 128 MB
-
-
-# --- choosing ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("rule", "scores", "best"),
     [
@@ -158,12 +122,6 @@ def test_the_best_and_the_earliest_of_them(rule, scores, best):
     assert chosen == best
 
 
-def test_held_out_by_hand():
-    labels = np.repeat([0, 1, 2, 3], [10, 7, 3, 2])
-    held = hold_out(labels, [f"{i:02d}" for i in range(22)], seed=1)
-    assert np.bincount(labels[held], minlength=4).tolist() == [2, 1, 1, 0]
-
-
 @given(
     st.lists(st.integers(0, 4), min_size=1, max_size=80),
     st.integers(0, 2**63 - 1),
@@ -180,11 +138,3 @@ def test_held_out_part(labels, seed, random):
     random.shuffle(order)
     again = hold_out(y[order], [ids[i] for i in order], seed)
     assert (again == held[order]).all()
-
-
-def test_another_seed_holds_others_out():
-    y, ids = np.zeros(100, dtype=int), [str(i) for i in range(100)]
-    assert (hold_out(y, ids, 3) == hold_out(y, ids, 3)).all()
-    assert (hold_out(y, ids, 3) != hold_out(y, ids, 4)).any()
-    confident = np.flatnonzero(hold_out(y, ids, 3))
-    assert confident.min() < 50 < confident.max()  # not only from one end

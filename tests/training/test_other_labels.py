@@ -108,7 +108,7 @@ def test_same_weights_predictions_and_estimates(data, tmp_path, case) -> None:
     np.testing.assert_array_equal(*said)
     for record in ours.rounds:
         rows = [
-            [(row.label, row.confidence, row.selected) for row in read_pseudo_labels(path)]
+            read_pseudo_labels(path)[["label", "confidence", "selected"]].to_numpy().tolist()
             for path in (pseudo_labels_path(folder, record.round) for folder in (one, two))
         ]
         assert rows[0] == rows[1]

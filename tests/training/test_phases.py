@@ -157,6 +157,8 @@ def test_each_round_is_labelled_by_its_teacher(name: str, request: pytest.Fixtur
     assert same(selected, run.net(epoch))
     for round_, teacher in ((0, selected), (1, run.net(ENDS[1]))):
         file = run.folder / f"round_{round_:02d}" / "pseudo_labels.csv"
-        table = [(row.id, row.label, row.confidence) for row in read_pseudo_labels(file)]
+        table = [
+            (row.id, row.label, row.confidence) for row in read_pseudo_labels(file).itertuples()
+        ]
         assert table == table_by(run, teacher)
         assert table != table_by(run, run.net(ENDS[0]))

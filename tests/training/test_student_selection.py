@@ -148,7 +148,8 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
     cfg = toy("selection.student=pseudo_val")
     metrics = train(cfg)
     held, held_labels = selection[0].held_out
-    rows = read_pseudo_labels(hashing.run_folder(cfg) / "round_01" / "pseudo_labels.csv")
+    file = hashing.run_folder(cfg) / "round_01" / "pseudo_labels.csv"
+    rows = [*read_pseudo_labels(file).itertuples()]
     selected = [i for i, row in enumerate(rows) if row.selected]
     for epoch in LAST_ROUND:
         index, labels = sets[epoch]
