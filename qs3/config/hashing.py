@@ -25,7 +25,6 @@ _UNHASHED = (
     "force",
     "callbacks.progress",
     "report",
-    "ckpt_path",
     "objective",
     "trainer.gpus",  # which of several GPUs trains a run
     "trainer.cuda_graphs",  # the same kernels, started at once

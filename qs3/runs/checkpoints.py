@@ -58,12 +58,6 @@ def load(
         return torch.load(file, map_location=device, weights_only=True)
 
 
-def check(path: str | os.PathLike[str], advice: str) -> None:
-    """Raise DataError, which ends with the advice, if a file of `save` is missing or damaged."""
-    with _intact(path, advice):
-        pass
-
-
 def copy_weights(net: nn.Module) -> dict[str, torch.Tensor]:
     """The net's parameters and buffers, copied to the CPU."""
     return {name: value.detach().cpu().clone() for name, value in net.state_dict().items()}

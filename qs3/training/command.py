@@ -93,10 +93,6 @@ def headline(metrics: RunMetrics) -> str:
 
 
 def _fit(run: Run) -> RunMetrics:
-    if run.cfg.ckpt_path is not None:  # before hours are spent on making the source
-        from qs3.training.resume import checkpoint_asked_for
-
-        checkpoint_asked_for(run)
     check_or_make(run.source, run.target, run.cfg.data.make_source)
     from qs3.training.evaluate import evaluate  # torch and Lightning from here on
     from qs3.training.fit import fit

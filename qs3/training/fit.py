@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,8 @@ from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.student_selection import Student, StudentSelection
 from qs3.training.load import Loaded, load_data, read_given
 from qs3.training.provenance import changed
-from qs3.training.resume import SharedWarmup, take_checkpoint, warmup_sha256
 from qs3.training.run import STUDENT, Run
+from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
 from qs3.utils.processor import Moment, cores, keep_freed_memory, number_of, processor_seconds
 
 log = logging.getLogger(__name__)
@@ -67,8 +67,6 @@ def fit(run: Run) -> tuple[Loaded, Built]:
     method: Method = build(run.cfg.method)
     given = read_given(run.cfg)
     loaded = load_data(run, method, given)
-    if not run.cfg.force:
-        loaded = replace(loaded, started=take_checkpoint(run, loaded.started))
     if trainer.threads == "auto":  # sums are ordered by the threads that the run was begun with
         torch.set_num_threads(loaded.started["threads"])
         log.info("trainer.threads=auto: %d of %d cores", torch.get_num_threads(), len(cores()))

@@ -36,7 +36,11 @@ log = logging.getLogger(__name__)
 
 
 def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
-    """Read `started.json` and compare it with today's data, or write it; `force` begins anew."""
+    """Read `started.json` and compare it with today's data, or write it; `force` begins anew.
+
+    Raises:
+        ConfigError, DataError: the run was begun with other settings or data.
+    """
     import torch
 
     from qs3.runs.checkpoints import LAST
@@ -60,24 +64,16 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
         remove_leftovers(folder)
     started = runs.read_started(run.folder)
     if started is not None:
-        compare(run.folder, started, now)
+        folder = run.folder
+        runs.check_config(folder, started.get("config_sha256"), now["config_sha256"])
+        for role in ("source", "target"):
+            runs.check_data(folder, f"data.{role}", started["data"][role], now["data"][role])
+        was, is_now = (_sha256_of(one["versions"]) for one in (started, now))
+        runs.check_data(folder, "the classifier that weights= names", was, is_now)
         if (run.folder / LAST).is_file():
             return started
     runs.write_started(run.folder, now)
     return now
-
-
-def compare(folder: Path, started: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to continue the run in a folder with other settings, data or another classifier.
-
-    Raises:
-        ConfigError, DataError: something differs.
-    """
-    runs.check_config(folder, started.get("config_sha256"), now["config_sha256"])
-    for role in ("source", "target"):
-        runs.check_data(folder, f"data.{role}", started["data"][role], now["data"][role])
-    was, is_now = (_sha256_of(one["versions"]) for one in (started, now))
-    runs.check_data(folder, "the classifier that weights= names", was, is_now)
 
 
 def _weights(cfg: DictConfig) -> str:

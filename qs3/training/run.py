@@ -82,7 +82,6 @@ class Settings:
     seed: Annotated[int, Ge(0)]
     num_classes: Annotated[int, Ge(2)]
     weights: str | None
-    ckpt_path: str | None
     force: Switch
     compile: Switch
     objective: Literal["entropy", "infomax", "snd"] | None  # none looks at the target's labels

@@ -41,15 +41,3 @@ def owned(folder: str | Path, doing: str = "training in") -> Iterator[None]:
     path = make_folder(folder) / _NAME
     with locked(path, f"another process is {doing} {folder}; wait for it, or choose another one"):
         yield
-
-
-def check_idle(folder: Path) -> None:
-    """Raise Qs3Error if another process trains in the folder, which need not be writable."""
-    path = folder / _NAME
-    if not os.access(path, os.R_OK):
-        return  # a copy
-    with open(path, "rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise Qs3Error(f"another process is training in {folder}; wait or stop it") from error

@@ -16,9 +16,9 @@ from omegaconf import OmegaConf
 
 from qs3.config import hashing
 from qs3.runs.checkpoints import load
-from qs3.training import resume
+from qs3.training import shared_warmup
 from qs3.training.command import train
-from qs3.training.resume import SharedWarmup, warmup_sha256
+from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
 from qs3.utils.files import copy_file, sha256_file
 from tests.training.conftest import result_of
 
@@ -120,7 +120,7 @@ def test_runs_that_start_together_share_one(tmp_path, caplog, monkeypatch):
                 thread.start()
                 thread.join(0.2)
 
-    monkeypatch.setattr(resume, "copy_file", come_meanwhile)
+    monkeypatch.setattr(shared_warmup, "copy_file", come_meanwhile)
     give(warmups, started(tmp_path / "first"))
     for thread in threads:
         thread.join()
@@ -140,7 +140,7 @@ def test_one_killed_while_it_replaces_a_damaged_one_leaves_none(tmp_path, caplog
         raise SystemExit
 
     with monkeypatch.context() as during:
-        during.setattr(resume, "copy_file", killed)
+        during.setattr(shared_warmup, "copy_file", killed)
         with pytest.raises(SystemExit):
             give(warmups, started(tmp_path / "second"))
     third = one_that_takes(tmp_path / "third", warmups)
