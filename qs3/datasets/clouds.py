@@ -37,7 +37,6 @@ from qs3.datasets.importing import (
     class_of,
     cloud_id,
     split_of,
-    visible,
 )
 from qs3.errors import DataError
 from qs3.store.meta import MadeOf, ManifestRow
@@ -198,7 +197,7 @@ class CloudFolder(Importer):
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`. Sorted by split, class and name."""
         read = functools.lru_cache(maxsize=1)(parse_clouds)  # one file in memory at a time
-        places = {path: self._place(path, classes) for path in _files(self.root)}
+        places = {path: self._place(path, classes) for path in self.watched()}
         found = [
             item
             for path, (cls, split) in places.items()
@@ -210,7 +209,7 @@ class CloudFolder(Importer):
 
     def watched(self) -> Iterable[Path]:
         """See `Importer`."""
-        return _files(self.root)
+        return sorted(_files(self.root))
 
     def _place(self, path: Path, classes: Sequence[str]) -> tuple[str, str]:
         """Class and split of a file by its folders; each "" where they do not say."""
@@ -284,12 +283,11 @@ def _label(label: Any, classes: Sequence[str], where: Path) -> str:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """All files of known formats below a folder, in order; links to folders are not followed."""
-    for path in visible(folder):
-        if path.is_dir():
-            if not path.is_symlink():  # it could lead in a circle, or give the same clouds twice
-                yield from _files(path)
-        elif path.suffix.lower() in SUFFIXES and path.is_file():
+    """All files of known formats below a folder; links to folders are not followed."""
+    for path in folder.rglob("*"):
+        below = path.relative_to(folder).parts
+        hidden = any(part.startswith(".") or part == "__MACOSX" for part in below)
+        if path.suffix.lower() in SUFFIXES and not hidden and path.is_file():
             yield path
 
 

@@ -102,6 +102,17 @@ class Rules:
         return self.limits.get(cls) or self.limits.get("default") or Limits()
 
 
+class Fault(NamedTuple):
+    """One thing that is wrong with a piece, in a word or two and with its figure.
+
+    A fault that `refuses` makes the piece useless, else it is hard.
+    """
+
+    kind: str
+    words: str
+    refuses: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Piece:
     """What was cut.
@@ -116,10 +127,8 @@ class Piece:
             nearer covers.
         extent_m: along x, y and z.
         depth_m: median distance along the optical axis.
-        tier: "clean" or "hard".
-        why: what makes it hard; or with `refused`, what is wrong.
-        refused: it cannot be used.
         own: the pixels of `points_m`; None where nothing was cut.
+        faults: what is wrong with it, once it was judged.
     """
 
     points_m: Float[np.ndarray, "n 3"]
@@ -131,10 +140,26 @@ class Piece:
     occ: float = 0.0
     extent_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth_m: float = 0.0
-    tier: str = CLEAN
-    why: str = ""
-    refused: bool = False
     own: Bool[np.ndarray, "h w"] | None = None
+    faults: tuple[Fault, ...] = ()
+
+    @property
+    def refused(self) -> bool:
+        """Whether it cannot be used."""
+        return any(fault.refuses for fault in self.faults)
+
+    @property
+    def tier(self) -> str:
+        """Clean without faults, else hard."""
+        return HARD if self.faults else CLEAN
+
+    @property
+    def why(self) -> str:
+        """What makes it hard, or why it is refused."""
+        if not self.refused:
+            return ", ".join(fault.kind for fault in self.faults)
+        few = [fault.words for fault in self.faults if fault.kind == FEW]
+        return ", ".join(few or [fault.words for fault in self.faults if fault.refuses])
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,17 +174,6 @@ class Box:
         """Whether each point is in it, made larger on all sides by `margin_m`."""
         within = np.abs((points_m - self.centre_m) @ self.axes.T) <= self.half_m + margin_m
         return within.all(axis=-1)
-
-
-class Fault(NamedTuple):
-    """One thing that is wrong with a piece, in a word or two and with its figure.
-
-    A fault that `refuses` makes the piece useless, else it is hard.
-    """
-
-    kind: str
-    words: str
-    refuses: bool
 
 
 def cut(
@@ -182,13 +196,7 @@ def cut(
         The object; or one that is `refused`, with the reason.
     """
     piece = cut_out(image, mask, rules, edge_px)
-    found = faults(piece, cls, rules)
-    if reasons := [fault.words for fault in found if fault.refuses]:
-        few = [fault.words for fault in found if fault.kind == FEW]
-        return replace(piece, refused=True, why=", ".join(few or reasons))
-    return replace(
-        piece, tier=HARD if found else CLEAN, why=", ".join(fault.kind for fault in found)
-    )
+    return replace(piece, faults=tuple(faults(piece, cls, rules)))
 
 
 def cut_out(

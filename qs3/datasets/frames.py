@@ -12,7 +12,7 @@ import abc
 import functools
 import logging
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -186,14 +186,8 @@ class FrameDataset(CutDataset):
             more |= {"tier": piece.tier, "why": piece.why, "depth_m": f"{piece.depth_m:.3f}"}
             more |= {key: f"{getattr(piece, key):.3f}" for key in ("holes", "rim", "occ")}
             reason = "" if piece.tier in self.tiers else f"{piece.tier} ({piece.why})"
-        return cut_row(self.names[name], origin, 1, points, reason, more)
-
-
-def cut_row(
-    cls: str, origin: str, views: int, points: int, reason: str, more: Mapping[str, str]
-) -> ManifestRow:
-    """An object of so many views and points, as far as a `Cutter` knows its row."""
-    return ManifestRow("", cls, "", None, "", origin, views, points, reason=reason, more=more)
+        row = ManifestRow("", self.names[name], "", origin=origin, views=1, reason=reason)
+        return replace(row, valid_points=points, more=more)
 
 
 def _worker(dataset: CutDataset) -> Callable[[FrameTask], Part | str]:

@@ -15,7 +15,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
@@ -161,10 +161,10 @@ class Importer(abc.ABC):
         """Plain values that decide what `read` gives; kept in the store's meta.yaml."""
         values = {"format": type(self).__name__, **dataclasses.asdict(self)}
         plain: dict[str, Any] = json.loads(json.dumps({**values, "folder": str(self.root)}))
-        there = [path for path in self.watched() if path.is_file()]
         seen = [
             (os.path.relpath(path, self.root), path.stat().st_size, path.stat().st_mtime_ns)
-            for path in there
+            for path in self.watched()
+            if path.is_file()
         ]
         if seen:
             plain["files"] = hashlib.sha256(repr(seen).encode()).hexdigest()
@@ -246,22 +246,6 @@ def split_of(name: str, where: str | Path) -> str:
     if split not in SPLITS:
         raise DataError(f"{where}: unknown split {name!r}; known are {', '.join(SPLITS)}")
     return split
-
-
-def visible(folder: Path) -> list[Path]:
-    """What is in a folder in order of its names, hidden things left out."""
-    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
-    return [folder / n for n in names if not n.startswith(".") and n != "__MACOSX"]
-
-
-def folders_in(folder: Path) -> Iterator[Path]:
-    """The visible folders in one, in order."""
-    return (path for path in visible(folder) if path.is_dir())
-
-
-def files_in(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
-    """The visible files with one of these extensions, in any case, in order."""
-    return (p for p in visible(folder) if p.suffix.lower() in suffixes and p.is_file())
 
 
 def check_cloud(cloud: np.ndarray, points: int, where: str) -> Float[np.ndarray, "P 3"]:

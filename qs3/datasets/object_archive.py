@@ -94,12 +94,12 @@ class Archive:
         start = self.arrays["start"]
         return int(start[index + 1] - start[index])
 
-    def cloud(self, index: int, inliers_only: bool) -> Float[np.ndarray, "n 3"]:
-        """[n, 3] float32 metres, z up, the camera at the origin."""
+    def cloud(self, index: int) -> Float[np.ndarray, "n 3"]:
+        """[n, 3] float32 metres, z up, the camera at the origin, without stray points."""
         part = slice(*self.arrays["start"][index : index + 2])
         centre = self.arrays["centre_m"][index].astype(np.float64)
         xyz = self.arrays["xyz_tenth_mm"][part] * _METRES + centre
-        if inliers_only and "inlier" in self.arrays:
+        if "inlier" in self.arrays:
             kept = self.arrays["inlier"][part]
             xyz = xyz[kept] if kept.any() else xyz
         return np.asarray(xyz, dtype=np.float32)
@@ -116,7 +116,6 @@ class ObjectArchive(Importer):
     folds: Annotated[int, Ge(2)] = 5
     gap: Annotated[int, Ge(0)] = 15
     block: Annotated[int, Ge(1)] = 30
-    inliers_only: bool = True
     tiers: list[Literal["clean", "hard"]] = field(default_factory=lambda: ["clean", "hard"])
     thins: ClassVar[bool] = True
 
@@ -155,7 +154,7 @@ class ObjectArchive(Importer):
             more = {"frame": str(frame), "sub": str(archive.sub[i]), "tier": tier}
             origin = f"{self.path.name}[{i}]"
             row = ManifestRow(f"{cls}/{split}/{name}", cls, split, None, "", origin, 1, more=more)
-            found.append(Item(row, functools.partial(archive.cloud, i, self.inliers_only)))
+            found.append(Item(row, functools.partial(archive.cloud, i)))
         if left:
             log.info("%s: objects left out: %s", self.path, dict(sorted(left.items())))
         return by_class(found, classes)

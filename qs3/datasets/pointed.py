@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.datasets.cutting import CLEAN, HARD, Piece, Rules, body, cut_out, faults, pieces
+from qs3.datasets.cutting import HARD, Piece, Rules, body, cut, pieces
 from qs3.datasets.depth_images import CAMERA_UP, DepthImage, Pinhole, checked_mask, upright
 from qs3.datasets.vertical import angle_deg, planes_up_steep
 from qs3.errors import DataError
@@ -138,20 +138,18 @@ def _judged(
     how: str,
     unsure: Sequence[Caution],
 ) -> Pointed:
-    piece = cut_out(image, mask, RULES, edge_px)
+    piece = cut(image, mask, "", RULES, edge_px)
     if not piece.pixels and edge_px:  # so thin that nothing else is there
-        piece = cut_out(image, mask, RULES, 0)
+        piece = cut(image, mask, "", RULES, 0)
     without, turn = int((mask & (image.depth_m <= 0)).sum()), image.world_from_camera
     if not piece.pixels:
         why = f"none of its {int(mask.sum())} pixels has depth"
         if (mask & (image.depth_m > 0)).any():
             why += f" from {RULES.near_m:g} to {RULES.far_m:g} m"
         return Pointed(name, piece, mask, without, POOR, (), how, turn, why)
-    found = faults(piece, "", RULES)
-    refused = any(fault.refuses for fault in found)  # by the importers of datasets
     boxed = any(caution.kind == BOX for caution in unsure)
-    tier = POOR if refused else HARD if found or boxed else CLEAN
-    cautions = (*(Caution(fault.kind, fault.words) for fault in found), *unsure)
+    tier = POOR if piece.refused else HARD if boxed else piece.tier
+    cautions = (*(Caution(fault.kind, fault.words) for fault in piece.faults), *unsure)
     return Pointed(name, piece, mask, without, tier, cautions, how, turn)
 
 

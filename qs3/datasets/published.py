@@ -25,8 +25,6 @@ from qs3.datasets.importing import (
     class_of,
     cloud_id,
     file_item,
-    files_in,
-    folders_in,
     split_of,
     turned,
 )
@@ -316,11 +314,10 @@ def _tree(
 
     Hidden files, other extensions, and folders of no class (None) are passed over.
     """
-    for class_folder in folders_in(root):
-        cls = class_named(class_folder.name)
-        for folder in folders_in(class_folder) if cls is not None else ():
-            split = split_of(folder.name, class_folder)
-            yield from ((path, cls or "", split) for path in files_in(folder, suffixes))
+    for path in sorted(root.glob("[!.]*/[!.]*/[!.]*")):
+        split = path.parent
+        if path.suffix.lower() in suffixes and (cls := class_named(split.parent.name)) is not None:
+            yield path, cls, split_of(split.name, split)
 
 
 def _of_h5(path: Path, split: str, names: Sequence[str], digits: int) -> Iterator[Cloud]:

@@ -20,7 +20,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -29,7 +29,7 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Bool, Float, Int, UInt
 
-from qs3.datasets.frames import CutDataset, Cutter, FrameTask, cut_row
+from qs3.datasets.frames import CutDataset, Cutter, FrameTask
 from qs3.datasets.scannet_files import (
     INSTANCES,
     LABELS,
@@ -147,7 +147,8 @@ def _extract(
             reason = "the label masks of its chosen frames give it another class"
         origin = f"scene {task.stem}, object {one.object_id}, label {one.label!r}, frames "
         origin += f"{' '.join(map(str, used)) or 'none'}, of {len(sightings[one])}"
-        found.append((cut_row(one.cls, origin, len(used), len(points), reason, {}), points))
+        row = ManifestRow("", one.cls, "", origin=origin, views=len(used), reason=reason)
+        found.append((replace(row, valid_points=len(points)), points))
     return found
 
 

@@ -33,7 +33,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from qs3.datasets.cutting import Box, Piece, box_mask, cut
+from qs3.datasets.cutting import Box, Fault, Piece, box_mask, cut
 from qs3.datasets.depth_images import DepthImage, Pinhole
 from qs3.datasets.frames import Cutter, FrameDataset, FrameTask, frame_task, load_mat
 from qs3.store.meta import MadeOf, ManifestRow
@@ -136,8 +136,8 @@ class SUNRGBD(FrameDataset):
             for number, (name, box) in enumerate(wanted, start=1):
                 if box is None:
                     nothing = np.zeros((0, 3), np.float32)
-                    why = "its numbers are not those of a box"
-                    piece = Piece(nothing, np.zeros(0, bool), 0, 1.0, why=why, refused=True)
+                    wrong = (Fault("box", "its numbers are not those of a box", True),)
+                    piece = Piece(nothing, np.zeros(0, bool), 0, 1.0, faults=wrong)
                 else:
                     mask = box_mask(image, box, self.rules)
                     piece = cut(image, mask, self.names[name], self.rules, edge_px=0)

@@ -203,7 +203,7 @@ def _archive(archive: Archive, part: str, classes: Sequence[str]) -> Inputs:
 
 
 def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sample]:
-    cloud = archive.cloud(index, inliers_only=True)
+    cloud = archive.cloud(index)
     tier, cautions = str(archive.tier[index]), []
     if tier == "hard":
         known = (archive.pixels, archive.rim, archive.occ)

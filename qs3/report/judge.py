@@ -106,7 +106,7 @@ def judge(
     kept = [i for i in chosen if names[i] is not None]
     if not kept:
         raise ConfigError(f"{data} has no objects of {', '.join(common)} in what was asked for")
-    clouds = [archive.cloud(i, inliers_only=True) for i in kept]
+    clouds = [archive.cloud(i) for i in kept]
     shown = [f"{data.name}[{i}]" for i in kept]
     called = {}
     with progress_bar("judging runs", total=len(nets)) as advance:

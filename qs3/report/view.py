@@ -69,7 +69,7 @@ def _archive(path: Path, most: int, wanted: Wanted) -> Part:
     shown = [
         Shown(
             names[i],
-            archive.cloud(i, inliers_only=True),
+            archive.cloud(i),
             label=str(archive.cls[i]),
             note=", ".join(dict.fromkeys((str(archive.sub[i]), str(archive.tier[i])))),
         )

@@ -1,6 +1,7 @@
 """Published formats: known answers, then every kind of damage we could think of."""
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -174,10 +175,11 @@ def test_clouds_that_were_not_published_so(cloud):
 
 def test_folders_that_do_not_fit(tmp_path):
     xyz_tree(tmp_path)
-    (tmp_path / "cat" / "train").mkdir(parents=True)
+    xyz_tree(tmp_path, classes=("cat",))
     with pytest.raises(DataError, match="cat"):
         PublishedTree(tmp_path, points=4).read(TWO, tmp_path)
-    (tmp_path / "cat").rename(tmp_path / "bed" / "dev")
+    shutil.rmtree(tmp_path / "cat")
+    (tmp_path / "bed" / "test").rename(tmp_path / "bed" / "dev")
     with pytest.raises(DataError, match="dev"):
         PublishedTree(tmp_path, points=4).read(TWO, tmp_path)
 

@@ -42,10 +42,6 @@ def test_points_classes_and_parts(file, tmp_path):
         block = f"block{arrays['img'][i] // 30:04d}"
         assert found.importer().object_of(row.id) == block
     assert str(data.made_of).startswith("real objects cut from depth images, archive ")
-    kept = domain(path, tmp_path / "kept", inliers_only="false")
-    kept.open()
-    sizes = {row.valid_points for row in read_manifest(kept.folder, data.classes)}
-    assert sizes <= set(arrays["pixels"].tolist())
 
 
 def test_parts_that_there_are_not_are_named(file, tmp_path):
