@@ -68,8 +68,6 @@ def _sensor(cfg: DictConfig) -> str:
         words.append(_named("materials", kinds, _MATERIALS))
     if light := cfg.get("light"):
         words.append(_named("light", light, _LIGHTS))
-    if errors := cfg.get("depth_errors"):
-        words += ["no holes"] * (not errors.holes) + ["no mixed pixels"] * (not errors.mixed_pixels)
     return ", ".join(words)
 
 

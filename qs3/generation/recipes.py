@@ -9,13 +9,12 @@ written into a dataset's recipe file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Protocol
 
 import cv2
 import numpy as np
 from annotated_types import Ge
-from jaxtyping import Bool, Float
 from pydantic import InstanceOf
 
 from qs3.errors import ConfigError, DataError
@@ -128,59 +127,6 @@ class MaskCrop(BoxCrop):
 
 
 @settings
-class DepthErrors:
-    """Which errors stay in a frame, to learn what the others are worth.
-
-    They are undone by the true depth, so scans with and without them have the same views and noise.
-
-    Attributes:
-        holes: False: where the object is seen and nothing was measured there is its true depth.
-        mixed_pixels: False: a depth that no surface close by has, as at the edge between two, is
-            dropped. It leaves a hole, which `holes` does not fill.
-        reach_px: pixels of the camera to each side that count as close by: half a matcher's block
-            and more, as blocks make surfaces wider; 6 for a Kinect's 9, 12 for the paper's 19.
-        apart_m, apart_per_m: a depth z belongs to a surface that is nearer to it than apart_m +
-            apart_per_m z^2; by default 2 cm and three standard deviations of a Kinect's noise.
-    """
-
-    holes: bool = True
-    mixed_pixels: bool = True
-    reach_px: Count = 6
-    apart_m: NotNegative = 0.02
-    apart_per_m: NotNegative = 0.005
-
-    def left_in(self, frame: DepthFrame) -> DepthFrame:
-        """The frame with the errors that stay; its reasons and pictures are what they were."""
-        depth, missing = frame.depth_m, np.isnan(frame.depth_m)
-        if not self.mixed_pixels:
-            depth = np.where(self.mixed(frame), np.float32(np.nan), depth)
-        if not self.holes:
-            depth = np.where(missing & (frame.label == 1), frame.clean_m, depth)
-        return frame if depth is frame.depth_m else replace(frame, depth_m=depth)
-
-    def mixed(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:
-        """Measured samples whose depth no true surface within `reach_px` has."""
-        steps = max(1, self.reach_px // frame.step_px)
-        close = _surface_near(frame.clean_m, frame.depth_m, steps)
-        with np.errstate(invalid="ignore"):
-            return close > self.apart_m + self.apart_per_m * frame.depth_m**2
-
-
-def _surface_near(
-    true_m: Float[np.ndarray, "h w"], depth_m: Float[np.ndarray, "h w"], steps: int
-) -> Float[np.ndarray, "h w"]:
-    """How far each depth is from the nearest of the true ones around it, m; NaN without a depth."""
-    height, width = depth_m.shape
-    near = np.where(np.isnan(depth_m), np.float32(np.nan), np.float32(np.inf))
-    around = np.pad(true_m, steps, constant_values=np.inf)
-    for row in range(2 * steps + 1):
-        for column in range(2 * steps + 1):
-            other = around[row : row + height, column : column + width]
-            near = np.fmin(near, np.abs(depth_m - other))
-    return near
-
-
-@settings
 class Mesh2Point:
     """Mesh to points through a simulated depth sensor.
 
@@ -195,7 +141,6 @@ class Mesh2Point:
         poses: from a file, in place of `placing` and of `views` (whose count is kept).
         materials: of the bodies; None: as the scene has them, matt.
         light: beside the sensor's own; None: none.
-        depth_errors: which of them stay; None: all.
         box_of_corners: crop by the box of the turned corners of the mesh's own box, as the
             released code does, and not by the object's own axis-aligned box.
     """
@@ -214,7 +159,6 @@ class Mesh2Point:
     poses: InstanceOf[PoseTable] | None = None
     materials: InstanceOf[MixedMaterials] | None = None
     light: LightAbove | None = None
-    depth_errors: InstanceOf[DepthErrors] | None = None
     box_of_corners: bool = False
     needs_renderer: bool = True
 
@@ -247,8 +191,6 @@ class Mesh2Point:
             frame = self.sensor.scan(bodies, box, pose, renderer, view_rng, explain, lighting)
             if frame is None:
                 continue
-            if self.depth_errors is not None:
-                frame = self.depth_errors.left_in(frame)
             frames.append(frame)
             if keep.view is not None:
                 keep.view(object_id, i, frame, pose, believed)
