@@ -77,6 +77,9 @@ class Importer(abc.ABC):
     recorded: ClassVar[str] = "imported"
     """The key of the settings in the store's meta.yaml."""
 
+    made: ClassVar[MadeOf] = MadeOf(objects="published files", published=True)
+    """What the store is made of, where it does not depend on the settings."""
+
     holds: ClassVar[str] = ""
     """A pattern of what is read, below the folder, where `files` does not name it."""
 
@@ -109,7 +112,7 @@ class Importer(abc.ABC):
 
     def made_of(self) -> MadeOf:
         """What the store is made of; goes into its meta.yaml."""
-        return MadeOf(objects="published files", published=True)
+        return self.made
 
     def judges(self) -> str:
         """Which published clouds are for test and should be looked at once; "" of most datasets."""

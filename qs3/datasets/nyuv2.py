@@ -28,7 +28,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -139,13 +139,13 @@ class NYUv2(FrameDataset):
     splits: str = "splits.mat"
     with_contents: dict[str, list[str]] = field(default_factory=dict)
 
+    made: ClassVar[MadeOf] = MadeOf(
+        objects="real objects cut from the raw depth of NYU Depth V2 (Kinect v1)"
+    )
+
     def files(self) -> Sequence[Path]:
         """See `FrameDataset`."""
         return [self.root / self.file, self.root / self.splits]
-
-    def made_of(self) -> MadeOf:
-        """See `Importer`."""
-        return MadeOf(objects="real objects cut from the raw depth of NYU Depth V2 (Kinect v1)")
 
     def tasks(self) -> list[FrameTask]:
         """See `FrameDataset`; finds the vertical of each frame on the way.

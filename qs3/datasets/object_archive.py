@@ -110,8 +110,6 @@ class ObjectArchive(Importer):
     """See the module; conf/domain/objects.yaml explains its settings."""
 
     file: str = "objects.npz"
-    train_parts: list[str] = field(default_factory=lambda: [ADAPT])
-    test_parts: list[str] = field(default_factory=lambda: [JUDGE])
     fold: Annotated[int, Ge(0)] | None = None
     folds: Annotated[int, Ge(2)] = 5
     gap: Annotated[int, Ge(0)] = 15
@@ -132,8 +130,7 @@ class ObjectArchive(Importer):
         """See `Importer`."""
         if self.fold is not None:
             return ""
-        parts = ", ".join(self.test_parts)
-        return f"part {parts} of {self.path.name} (all of it, if it has no parts)"
+        return f"part {JUDGE} of {self.path.name} (all of it, if it has no parts)"
 
     def files(self) -> list[Path]:
         """See `Importer`."""
@@ -171,16 +168,11 @@ class ObjectArchive(Importer):
 
     def _splits(self, archive: Archive) -> list[str]:
         """The split of each object; "" for those that are left out."""
-        asked = {*self.train_parts, *self.test_parts}
-        if unknown := sorted(asked - {*archive.parts, ADAPT, JUDGE}):
-            raise ConfigError(f"{self.path}: {unknown} are not of its parts {[*archive.parts]}")
         if self.fold is None:
             if not (archive.dev != "").any():
                 return ["test"] * len(archive)
-            split = dict.fromkeys(self.train_parts, "train")
-            split |= dict.fromkeys(self.test_parts, "test")
-            return [split.get(str(part), "") for part in archive.dev]
-        ours, frames = np.isin(archive.dev, self.train_parts), archive.frame
+            return [{ADAPT: "train", JUDGE: "test"}.get(str(part), "") for part in archive.dev]
+        ours, frames = archive.dev == ADAPT, archive.frame
         blocks = np.unique(frames[ours] // self.block)
         assert self.fold < self.folds <= len(blocks), f"{len(blocks)} blocks of frames"
         tested = np.array_split(blocks, self.folds)[self.fold]

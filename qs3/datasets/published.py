@@ -53,9 +53,8 @@ class PublishedTree(Importer):
     """One file a cloud, `<class>/<split>/<name>`.
 
     SpeckleNet10 and DepthScanNet10 are published as .xyz (text, 2048 rows of x y z), PointDA-10's
-    ModelNet10 and ShapeNet10 as .npy ([2048, 3] and [1024, 3]). Clouds come split by split, in each
-    class by class, in each sorted by file name: the order in which the code of the lineage lists
-    them, and by which it cuts off its validation part.
+    ModelNet10 and ShapeNet10 as .npy ([2048, 3] and [1024, 3]). Clouds come by split, class and
+    file name, as the code of the lineage lists them, which so cuts off its validation part.
 
     Attributes:
         up: axis that points up in the files.
@@ -129,26 +128,19 @@ class ModelNetMeshes(Importer):
 
     The folder is that of the unpacked archive, or the root of torch_geometric.datasets.ModelNet,
     which keeps the same tree in `raw/`. Points are uniform on the area, as PyG's SamplePoints and
-    PointDA-10 draw them; every object has its own seed, made from the dataset's seed and its id.
-    The files stand on z, in the units of their makers. Folders of other classes are left alone.
-
-    Attributes:
-        seed: of the dataset; another one gives other points on the same surfaces.
+    PointDA-10 draw them, by a seed of each object. Folders of other classes are left alone.
     """
 
     seed: Annotated[int, Ge(0)] = 0
 
     holds: ClassVar[str] = "*/train/*.off"
+    made: ClassVar[MadeOf] = MadeOf(objects="ModelNet's published meshes", sensor="surface samples")
 
     @property
     def root(self) -> Path:
         """See `Importer`."""
         folder = super().root
         return folder / "raw" if (folder / "raw").is_dir() else folder
-
-    def made_of(self) -> MadeOf:
-        """See `Importer`."""
-        return MadeOf(objects="ModelNet's published meshes", sensor="surface samples")
 
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`. By split, in it by class, in it by name."""
@@ -194,11 +186,7 @@ class ArrayFiles(Importer):
 
 @settings
 class NamedArrays(ArrayFiles):
-    """One .npz with arrays `points` [N, P, 3], `cls` [N], `split` [N] and `name` [N].
-
-    Attributes:
-        file: name of the .npz in the folder.
-    """
+    """One .npz with arrays `points` [N, P, 3], `cls` [N], `split` [N] and `name` [N]."""
 
     file: str = "points.npz"
 

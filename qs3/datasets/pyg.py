@@ -83,7 +83,6 @@ def from_pyg(
     *,
     classes: str | Sequence[str] | None = None,
     points: int | None = None,
-    name: str | None = None,
 ) -> PointSet:
     """Write datasets of PyG as one of ours, which a domain can name by its `path`.
 
@@ -99,7 +98,6 @@ def from_pyg(
             if it has any; without labels the benchmark's ten.
         points: of a cloud; larger ones are thinned to their farthest points, from the first on.
             None: all clouds must have the same number.
-        name: of the new dataset; None: that of the folder.
     """
     folder = Path(folder)
     if is_finished(folder) or is_begun(folder):
@@ -122,7 +120,7 @@ def from_pyg(
         rows.append(ManifestRow(id=key, cls=cls, split=split, valid_points=len(pos)))
     return write_pointset(
         folder,
-        name=name or folder.name,
+        name=folder.name,
         classes=names,
         arrays={"points": clouds},
         rows=rows,

@@ -80,14 +80,11 @@ class ScanNet(CutDataset):
     stride: Count = 1
 
     recorded: ClassVar[str] = "extraction"
+    made: ClassVar[MadeOf] = MadeOf(objects="ScanNet's raw depth, cropped by its masks here")
 
     def files(self) -> Sequence[Path]:
         """See `CutDataset`."""
         return [self.root / name for name in (self.labels, self.train, self.val)]
-
-    def made_of(self) -> MadeOf:
-        """See `Importer`."""
-        return MadeOf(objects="ScanNet's raw depth, cropped by its masks here")
 
     def tasks(self) -> list[FrameTask]:
         """See `CutDataset`: the scenes of the lists that are there."""

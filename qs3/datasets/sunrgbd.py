@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -106,13 +106,13 @@ class SUNRGBD(FrameDataset):
     sensors: list[Sensor] = field(default_factory=lambda: list(SENSORS))
     splits: str = SPLITS
 
+    made: ClassVar[MadeOf] = MadeOf(
+        objects="real objects cut by their boxes from the raw depth of SUN RGB-D"
+    )
+
     def files(self) -> Sequence[Path]:
         """See `FrameDataset`."""
         return [self.root / META, self.root / self.splits]
-
-    def made_of(self) -> MadeOf:
-        """See `Importer`."""
-        return MadeOf(objects="real objects cut by their boxes from the raw depth of SUN RGB-D")
 
     def tasks(self) -> list[FrameTask]:
         """See `FrameDataset`; frames of the chosen sensors that are of a split."""

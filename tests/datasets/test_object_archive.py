@@ -5,7 +5,7 @@ import pytest
 
 from qs3.datamodules.domain import DomainData
 from qs3.datasets.domain import compose_domain
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.store.meta import is_finished, read_manifest
 from tests.fixtures.frame_files import write_archive
 
@@ -42,17 +42,6 @@ def test_points_classes_and_parts(file, tmp_path):
         block = f"block{arrays['img'][i] // 30:04d}"
         assert found.importer().object_of(row.id) == block
     assert str(data.made_of).startswith("real objects cut from depth images, archive ")
-
-
-def test_parts_that_there_are_not_are_named(file, tmp_path):
-    """A word would be a list of letters, a misspelling would leave a split without a cloud."""
-    path, _ = file
-    for key in ("train_parts", "test_parts", "tiers"):
-        with pytest.raises(ConfigError):
-            domain(path, tmp_path, **{key: "clean"}).importer()
-    for more in ({"train_parts": "[adpat]"}, {"test_parts": "[adpat]"}):
-        with pytest.raises(ConfigError):
-            domain(path, tmp_path, **more).open()
 
 
 def test_folds_part_the_training_part_and_keep_away(file, tmp_path):
