@@ -48,15 +48,6 @@ def test_gpus_in_turn_and_a_failure(launcher, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_job_is_listed(tmp_path):
-    """With submitit each job has a process of its own, so that one that dies harms no other."""
-    result = light(tmp_path, "seed=8,1", "hydra/launcher=submitit_local")
-    assert result.returncode == 1
-    assert "1 of 2 jobs failed:\n  did not end: killed" in result.stdout
-    assert len(light_runs(tmp_path)) == 1
-
-
-@pytest.mark.slow
 def test_a_job_of_rays_whose_process_is_killed_begins_again(tmp_path):
     """Once is made good, three times is listed; neither harms the others."""
     result = light(tmp_path, "seed=6,8,1", "hydra/launcher=ray", "hydra.launcher.jobs=1")

@@ -1,4 +1,4 @@
-"""Whole runs on the toy problem: seeds, skipping, labels that must stay hidden, errors."""
+"""Whole runs on the toy problem: seeds, skipping, force, labels that must stay hidden, errors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import importlib
 import json
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,14 @@ import pytest
 import torch
 
 from qs3.config import hashing
-from qs3.errors import ConfigError, DataError, Qs3Error, SelectionError
+from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training.command import train
 from qs3.training.run import SCALES
 from qs3.utils.locks import owned
 from qs3.utils.version import VERSION, commit
 from tests.training.conftest import result_of
+from tests.training.watching import interrupt
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -184,3 +186,76 @@ def test_other_settings_of_the_same_name_and_changed_data_are_refused(toy, place
     (folder / "metrics.json").unlink()
     with pytest.raises(error):
         train(cfg)
+
+
+def without(data: Path) -> None:
+    shutil.rmtree(data)
+
+
+def damaged(data: Path) -> None:
+    (data / "kinectsim10" / "points.npy").write_bytes(b"")
+
+
+@pytest.mark.parametrize("ruin", [without, damaged])
+def test_an_old_result_stays_where_its_data_cannot_be_opened(toy, toy_data, tmp_path, ruin):
+    """Such as of a mistyped folder: where data lie is no part of a run's name."""
+    folder = hashing.run_folder(toy())
+    for name in ("metrics.json", "result.pt", "round_00/pseudo_labels.csv"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+    shutil.copytree(toy_data, tmp_path / "data")
+    ruin(tmp_path / "data")
+    with pytest.raises(MissingDataError if ruin is without else DataError):
+        train(toy(f"paths.data_dir={tmp_path / 'data'}", "force=true"))
+    for name in ("metrics.json", "result.pt", "round_00/pseudo_labels.csv"):
+        assert (folder / name).read_text() == name
+
+
+def test_a_run_of_few_clouds_leaves_no_cache(toy, tmp_path):
+    cfg = toy("data.clouds_a_split=12", "selftraining=none", f"data.cache_dir={tmp_path / 'cache'}")
+    metrics = train(cfg)
+    assert metrics.final.n == 12
+    assert not list((tmp_path / "cache").rglob("*.npy"))
+
+
+def change_started(folder, **changes) -> None:
+    """`started.json` of a run that other software began."""
+    file = folder / "started.json"
+    document = json.loads(file.read_text())
+    for key, value in changes.items():
+        (document["versions"] if key == "torch" else document)[key] = value
+    file.write_text(json.dumps(document))
+
+
+def test_a_run_that_other_software_began_warns(toy, finished, caplog):
+    cfg = toy("paths.warmup_dir=null")
+    interrupt(cfg, epoch=6)
+    change_started(hashing.run_folder(cfg), torch="1.0", threads=77)
+    metrics = train(cfg)
+    assert "begun with torch 1.0, threads 77, continued with torch" in caplog.text
+    assert metrics.versions["torch"] == "1.0"
+    ours, theirs = result_of(hashing.run_folder(cfg)), result_of(finished)
+    for result in (ours, theirs):
+        del result["metrics"]["versions"]
+    assert ours == theirs
+
+
+def test_a_checkpoint_with_a_flipped_bit_is_refused(toy):
+    cfg = toy("paths.warmup_dir=null")
+    interrupt(cfg, epoch=1)
+    own = hashing.run_folder(cfg) / "last.ckpt"
+    data = bytearray(own.read_bytes())
+    data[len(data) // 2] ^= 1
+    own.write_bytes(data)
+    with pytest.raises(DataError, match=r"last\.ckpt"):
+        train(cfg)
+
+
+@pytest.mark.parametrize("changed", [{}, {"torch": "1.0"}, {"files": {"qs3's code": "0" * 64}}])
+def test_a_warm_up_of_two_versions_is_given_to_nobody(toy, changed, tmp_path, caplog):
+    cfg = toy(f"paths.warmup_dir={tmp_path / 'warmups'}")
+    interrupt(cfg, epoch=2)
+    change_started(hashing.run_folder(cfg), **changed)
+    train(cfg)
+    assert ("begun with" in caplog.text) == bool(changed)
+    assert (tmp_path / "warmups").exists() == (not changed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -164,59 +163,3 @@ def test_a_training_that_is_ended_says_so(how, more, toy_data, tmp_path):
     assert process.returncode == 128 + how, said
     assert "Traceback" not in out + said
     assert said.endswith("ed; run the same command again and it continues\n")
-
-
-@pytest.mark.slow
-def test_killed_at_random_instants(toy_data, tmp_path):
-    """SIGKILL 24 times, at instants spread over the whole fit and the final evaluation."""
-    longer = ("protocol.epochs=40", "selftraining.epochs=15", "selftraining.rounds=3")
-    command = [sys.executable, str(ROOT / "train.py")]
-    command += overrides(tmp_path, f"paths.data_dir={toy_data}", *longer)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-
-    def start(name: str) -> tuple[subprocess.Popen, Path]:
-        """Start in a log folder of its own; return when the fit is about to begin."""
-        process = subprocess.Popen(
-            [*command, f"paths.log_dir={tmp_path / name}"], cwd=tmp_path, env=environment
-        )
-        lines = len(logged(name))
-        while process.poll() is None and not any(
-            "fitting" in line for line in logged(name)[lines:]
-        ):
-            time.sleep(0.005)
-        assert process.poll() in (None, 0)
-        (folder,) = (tmp_path / name / "quickstart").iterdir()
-        return process, folder
-
-    def logged(name: str) -> list[str]:
-        return [
-            line
-            for path in (tmp_path / name).glob("*/*/train.log")
-            for line in path.read_text().splitlines()
-        ]
-
-    process, reference = start("reference")
-    began = time.monotonic()
-    assert process.wait() == 0
-    whole = time.monotonic() - began
-    expected = result_of(reference)
-
-    rng, kills, number, epochs = random.Random(0), 0, 0, set()
-    while kills < 24:
-        number += 1
-        for _ in range(6):  # so often at most, then the run may end
-            process, folder = start(f"killed{number}")
-            time.sleep(rng.uniform(0, 0.6) * whole)
-            if process.poll() is None:
-                process.send_signal(signal.SIGKILL)
-                process.wait()
-                kills += 1
-            checkpoint = folder / "last.ckpt"
-            epochs.add(load(checkpoint)["epoch"] if checkpoint.is_file() else -1)
-            if (folder / "metrics.json").is_file():
-                break
-        process, folder = start(f"killed{number}")
-        assert process.wait() == 0
-        assert result_of(folder) == expected
-    print(f"{kills} kills in {number} runs of {whole:.1f} s; last epochs {sorted(epochs)}")  # noqa: T201
-    assert len(epochs) > 10  # they did hit many different epochs
