@@ -70,13 +70,9 @@ class AdaptationData(LightningDataModule):
         super().__init__()
         assert sampler == "shuffled" or owner == "source"
         self.source, self.make_source = source, make_source
-        self.labelled_domain = DomainData(
-            source if owner == "source" else target,
-            val=val,
-            sampler=sampler,
-            clouds_a_class=clouds_a_class,
-            **shared,
-        )
+        labelled = source if owner == "source" else target
+        shown: dict[str, Any] = {"sampler": sampler, "clouds_a_class": clouds_a_class}
+        self.labelled_domain = DomainData(labelled, val=val, **shown, **shared)
         self.target_domain = DomainData(target, labels=False, **shared)
         self.owner, self.uses_target, self.again = owner, uses_target, again
         self.phases, self.scheme, self.augment = phases, scheme, augment

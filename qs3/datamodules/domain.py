@@ -192,17 +192,10 @@ class DomainData(LightningDataModule):
         assert part is not None, "setup() of this stage comes first, and the split has clouds"
         trainer = self.trainer if shuffle else None
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
+        more: dict[str, Any] = {"seed": self.seed, "shuffle": shuffle, "rank": rank, "world": world}
 
         def batches(epoch: int) -> Batches:
-            return Batches(
-                {Loader.KEY: part},
-                batch_size,
-                seed=self.seed,
-                epoch=epoch,
-                shuffle=shuffle,
-                rank=rank,
-                world=world,
-            )
+            return Batches({Loader.KEY: part}, batch_size, epoch=epoch, **more)
 
         return Loader(batches, self._epoch if shuffle else int)
 
@@ -216,9 +209,7 @@ class DomainData(LightningDataModule):
 class Loader:
     """Batches of one domain, made anew for each pass.
 
-    Args:
-        make: the batches of an epoch, of a domain called `KEY`.
-        epoch: which one the next pass is.
+    `make`: the batches of an epoch, of a domain called `KEY`; `epoch`: which one the next pass is.
     """
 
     KEY: ClassVar[str] = "domain"

@@ -162,7 +162,10 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     predictions = evaluation.predictions_of(reported(file))
     if built.trainer.is_global_zero:
         _write(run, loaded, nets, file, learnt, predictions)
-    prior, called = prior_of(file), component_names(cfg)
+    prior, called, student = prior_of(file), component_names(cfg), None
+    if choice is not None:
+        of_last = EpochScores(epoch=run.phases.total - 1, scores=scores["student"])
+        student = StudentChoice(**choice.record(), last=of_last)
     return RunMetrics(
         experiment=cfg.experiment_name,
         hash=hashing.config_hash(cfg),
@@ -208,12 +211,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
             )
             for record in built.rounds.records
         ],
-        student=None
-        if choice is None
-        else StudentChoice(
-            **choice.record(),
-            last=EpochScores(epoch=run.phases.total - 1, scores=scores["student"]),
-        ),
+        student=student,
         validators=without_labels(nets.of("target", file), choice),
         quality=_quality(run, loaded, nets, file),
         training=None
