@@ -154,8 +154,7 @@ def judge(subject: Subject, flat: pd.DataFrame, edge: dict[str, Any]) -> list[Ba
     gentle = flat[flat.tilt_deg <= 45]
     found: list[_Row] = []
     if isinstance(sensor, FittedDepth):
-        stated = np.interp(gentle.tilt_deg, sensor.tilts_deg, sensor.fill_rates)
-        off = _farthest(1 + gentle.fill - stated, 1.0) - 1
+        off = _farthest(gentle.fill - sensor.fill_rate, 0.0)
         found.append(("fill beside the preset's own up to 45 degrees", off, -0.05, 0.05))
     else:
         if subject.focal_baseline is not None:

@@ -80,7 +80,7 @@ correlation_px: {noise.correlation_px:.3g}
 inverse_step_per_m: {steps.inverse_per_m:.8g}
 depth_step_m: {steps.depth_m:.6g}
 bias_m: [{", ".join(f"{value:.6g}" for value in bias_m)}]
-fill_rates: [{np.mean([wall.fill for wall in walls]):.4g}]
+fill_rate: {np.mean([wall.fill for wall in walls]):.4g}
 baseline_m: {"null" if baseline is None else f"{baseline:.6g}"}
 """
     return text, noise

@@ -10,6 +10,7 @@ import numpy as np
 
 from qs3.geometry.cameras import Camera, Intrinsics, Window, project
 from qs3.sensors.matching import Match, StereoBlockMatcher
+from qs3.sensors.matching.base import found_px
 from qs3.sensors.matching.filters import PostFilter, Quantiser
 from qs3.sensors.optics.visibility import Reason, explained, reached_from
 from qs3.sensors.renderers.base import AreaLight, Body, Image, Projector, Renderer, Scene
@@ -268,6 +269,15 @@ class TriangulatingSensor(DepthSensor):
     def __post_init__(self) -> None:
         assert self.min_depth_m < self.max_depth_m, "min_depth_m must be below max_depth_m"
         matcher = getattr(self, "matcher", None)
+        if matcher is None:
+            return
+        scale, zero = self.focal_px * self.baseline_m, self.zero_disparity_px
+        low, high = (scale / depth_m - zero for depth_m in (self.max_depth_m, self.min_depth_m))
+        least, most = found_px(matcher)
+        assert least <= low < high <= most, (
+            f"the depths need disparities {low:.1f} to {high:.1f} px, the matcher finds {least:g} "
+            f"to {most:g}"
+        )
         unbiased = isinstance(matcher, StereoBlockMatcher) and matcher.remove_bias
         # k / 16 less nearly half a step would be rounded straight back to k / 16.
         undone = unbiased and self.quantiser.steps_per_px == 16

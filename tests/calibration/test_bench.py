@@ -135,7 +135,7 @@ def test_a_fitted_preset_is_held_against_what_it_states(renderer, baseline_m):
     sensor = FittedDepth(
         width_px=320, height_px=240, focal_px=290, baseline_m=baseline_m, noise_factor=0.0027,
         noise_power=1.0, bias_m=(0.002, 0.003, 0.001), inverse_step_per_m=0.00575,
-        depth_step_m=0.001, tilts_deg=(0.0, 30.0, 70.0), fill_rates=(0.97, 0.95, 0.6),
+        depth_step_m=0.001, fill_rate=0.97,
     )  # fmt: skip
     subject = Subject("my_d415", sensor)  # no preset of ours, whose bands go by its name
     rows = pd.DataFrame(
@@ -149,7 +149,7 @@ def test_a_fitted_preset_is_held_against_what_it_states(renderer, baseline_m):
     found = judge(subject, rows, edge)
     assert failures(found) == []
     assert len(found) == 2
-    other = replace(sensor, fill_rates=(0.97, 0.85, 0.9))
+    other = replace(sensor, fill_rate=0.85)
     assert "fill" in " ".join(failures(judge(Subject("mine", other), rows, edge)))
 
 

@@ -11,7 +11,7 @@ from qs3.sensors.devices.time_of_flight import TimeOfFlight
 from qs3.sensors.matching import CensusMatcher, ReferenceMatcher, StereoBlockMatcher
 from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.optics.infrared import InfraredCamera
-from qs3.sensors.optics.patterns import ReleasedSlide, Speckle
+from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 
@@ -26,8 +26,7 @@ WRONG = [
     (ReferenceSpeckle, {"matcher": ReferenceMatcher(num_disparities=24)}),
     (DotMask, {"window_px": 8}),
     (DotMask, {"min_depth_m": 9.0}),
-    (FittedDepth, {"tilts_deg": (0.0, 10.0)}),
-    (FittedDepth, {"tilts_deg": (10.0, 0.0), "fill_rates": (1.0, 1.0)}),
+    (FittedDepth, {"fill_rate": 1.1}),
     (FringeCode, {"periods": (1.0, 64.0, 8.0)}),
     (FringeCode, {"periods": (2.0, 8.0)}),
     (FringeCode, {"periods": (1.0, 200.0)}),
@@ -39,7 +38,6 @@ WRONG = [
     (CensusMatcher, {"small_step": 50.0}),
     (CensusMatcher, {"block_px": 31}),  # its costs exceed 16 bits
     (InfraredCamera, {"metering": "centre"}),
-    (ReleasedSlide, {"brightness_spread": 0.5}),
     (BlenderRenderer, {"samples": 0}),
     (MitsubaRenderer, {"samples": 0}),
 ]

@@ -37,8 +37,7 @@ class FittedDepth(DepthSensor):
         inverse_step_per_m: step of 1 / Z in 1/m (Kinect v1: 1 / (8 f b)); 0 is none.
         depth_step_m: step of Z, applied after that; 0 is none.
         bias_m: coefficients of bias(Z), the constant first.
-        tilts_deg, fill_rates: share of valid pixels at these angles of incidence, interpolated
-            in between and constant outside.
+        fill_rate: share of valid pixels.
         baseline_m: projector minus camera along the camera's x; what it does not reach is not
             measured. null: no shadows.
     """
@@ -56,14 +55,11 @@ class FittedDepth(DepthSensor):
     inverse_step_per_m: NotNegative = 0.0
     depth_step_m: NotNegative = 0.0
     bias_m: tuple[float, ...] = (0.0,)
-    tilts_deg: tuple[float, ...] = (0.0,)
-    fill_rates: tuple[Share, ...] = (1.0,)
+    fill_rate: Share = 1.0
     baseline_m: float | None = None
 
     def __post_init__(self) -> None:
         assert self.min_depth_m < self.max_depth_m, "min_depth_m must be below max_depth_m"
-        assert len(self.tilts_deg) == len(self.fill_rates) > 0, "as many tilts_deg as fill_rates"
-        assert self.tilts_deg == tuple(sorted(set(self.tilts_deg))), "tilts_deg must increase"
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -80,12 +76,9 @@ class FittedDepth(DepthSensor):
         return self.noise_floor_m + self.noise_factor * depth_m**self.noise_power
 
     def measure(
-        self, clean_m: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
+        self, clean_m: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Measure true depths [h, w], inf where nothing is: float32 with NaN, and uint8 `Reason`.
-
-        `cosine` [h, w] is that of the angle of incidence.
-        """
+        """Measured depth [h, w] float32 with NaN, and uint8 `Reason`, of true depths with inf."""
         noise = _smooth(clean_m.shape, self.correlation_px / self.step_px, rng)
         hit = np.isfinite(clean_m)
         true = np.where(hit, clean_m, 1.0).astype(np.float64)
@@ -97,9 +90,7 @@ class FittedDepth(DepthSensor):
             found = 1 / (steps * self.inverse_step_per_m)
         if self.depth_step_m:
             found = np.rint(found / self.depth_step_m) * self.depth_step_m
-        tilt = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
-        rate = np.interp(tilt, self.tilts_deg, self.fill_rates)
-        lost = rng.random(clean_m.shape) >= rate
+        lost = rng.random(clean_m.shape) >= self.fill_rate
         inside = (found > self.min_depth_m) & (found < self.max_depth_m)
         reason = first_reason(
             {Reason.EMPTY: ~hit, Reason.UNMATCHED: lost, Reason.RANGE: ~inside}, Reason.OK
@@ -111,7 +102,7 @@ class FittedDepth(DepthSensor):
         """See `DepthSensor.take`. Shadows are always explained."""
         image, at = shot.image(), shot.samples(self.step_px)
         clean = at.of(image.depth_m)
-        depth, reason = self.measure(clean, at.of(image.cosine), shot.rng)
+        depth, reason = self.measure(clean, shot.rng)
         pictures = {"clean": image.depth_m}
         if self.baseline_m is not None:
             pictures["lit"] = shot.reached_from(shot.pose_at(self.baseline_m))

@@ -16,7 +16,7 @@ import numpy as np
 
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Matcher, ReferenceMatcher
-from qs3.sensors.matching.base import for_picture, found_px
+from qs3.sensors.matching.base import for_picture
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.renderers.base import Projector
@@ -47,19 +47,6 @@ class ReferenceSpeckle(TriangulatingSensor):
     infrared: InfraredCamera = field(
         default_factory=lambda: InfraredCamera(electrons_at_white=4000.0, read_noise_e=40.0)
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        low, high = (self.disparity(z) for z in (self.max_depth_m, self.min_depth_m))
-        least, most = found_px(self.matcher)
-        assert least <= low < high <= most, (
-            f"the depths need disparities {low:.1f} to {high:.1f} px, the matcher finds {least:g} "
-            f"to {most:g}"
-        )
-
-    def disparity(self, depth_m: float) -> float:
-        """Disparity in px of a plane at `depth_m`."""
-        return self.focal_px * self.baseline_m * (1 / depth_m - 1 / self.reference_m)
 
     @property
     def zero_disparity_px(self) -> float:

@@ -21,7 +21,7 @@ from annotated_types import Ge
 from qs3.geometry.cameras import Camera, Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
 from qs3.sensors.matching import Matcher, StereoBlockMatcher
-from qs3.sensors.matching.base import for_picture, found_px
+from qs3.sensors.matching.base import for_picture
 from qs3.sensors.optics.infrared import FilmicCamera, InfraredCamera
 from qs3.sensors.optics.misalignment import Misalignment
 from qs3.sensors.optics.patterns import Speckle
@@ -74,12 +74,6 @@ class SpeckleStereo(TriangulatingSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         assert (self.sample_offset_px or 0) < self.step_px, "sample_offset_px must be in a step"
-        scale, (least, most) = self.focal_px * self.baseline_m, found_px(self.matcher)
-        low, high = scale / self.max_depth_m, scale / self.min_depth_m
-        assert least <= low < high <= most, (
-            f"the depths need disparities {low:.1f} to {high:.1f} px, the matcher finds {least:g} "
-            f"to {most:g}"
-        )
 
     @property
     def margin_px(self) -> int:

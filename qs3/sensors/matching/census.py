@@ -89,55 +89,46 @@ STRIP_ROWS = 64
 """Rows that are turned at a time for the horizontal paths: some MB, which a cache holds."""
 
 
-def aggregate(cost: np.ndarray, small: int, large: int, paths: int) -> np.ndarray:
-    """Sum of the path costs.
+def aggregate(cost: np.ndarray, small: int, large: int) -> np.ndarray:
+    """Sum of the path costs along rows and columns, both ways.
 
     Args:
-        cost: [h, w, D] uint16; paths * (largest cost + large) must be below 65536.
+        cost: [h, w, D] uint16; 4 * (largest cost + large) must be below 65536.
         small: P1, for a step of one disparity between neighbours.
         large: P2, for any larger step.
-        paths: 4 (along rows and columns) or 8 (and diagonals).
 
     Returns:
         [h, w, D] uint16.
     """
     total = np.zeros_like(cost)
-    sideways = (-1, 0, 1) if paths == 8 else (0,)
-    for shift in sideways:
-        for flip in (slice(None), slice(None, None, -1)):
-            _sweep(cost[flip], total[flip], small, large, shift)
+    both_ways = (slice(None), slice(None, None, -1))
+    for flip in both_ways:
+        _sweep(cost[flip], total[flip], small, large)
     for top in range(0, len(cost), STRIP_ROWS):
         rows = slice(top, top + STRIP_ROWS)
         turned = np.ascontiguousarray(cost[rows].transpose(1, 0, 2))
         total_turned = np.zeros_like(turned)
-        for flip in (slice(None), slice(None, None, -1)):
-            _sweep(turned[flip], total_turned[flip], small, large, 0)
+        for flip in both_ways:
+            _sweep(turned[flip], total_turned[flip], small, large)
         total[rows] += total_turned.transpose(1, 0, 2)
     return total
 
 
-def _sweep(cost: np.ndarray, total: np.ndarray, small: int, large: int, shift: int) -> None:
-    """Add to `total` the costs of paths that step from line i - 1, place m - shift to i, m.
-
-    `cost` and `total` are [lines, places, D] uint16.
-    """
-    lines, places, _ = cost.shape
+def _sweep(cost: np.ndarray, total: np.ndarray, small: int, large: int) -> None:
+    """Add to `total` the costs of paths from line to line; both are [lines, places, D] uint16."""
     p1, p2 = np.uint16(small), np.uint16(large)
-    # Kept with its minimum at 0, so that min L_p drops out; zero, as before the first line, at
-    # both ends, where diagonals enter.
-    kept = np.zeros((places + 2, cost.shape[2]), dtype=np.uint16)
-    before = kept[1 - shift : 1 - shift + places]
-    here = kept[1:-1]
-    best = np.empty_like(here)
-    step = np.empty_like(here)
-    for i in range(lines):
+    # Kept with its minimum at 0, so that min L_p drops out.
+    before = np.zeros(cost.shape[1:], dtype=np.uint16)
+    best = np.empty_like(before)
+    step = np.empty_like(before)
+    for i in range(len(cost)):
         np.minimum(before, p2, out=best)
         np.add(before, p1, out=step)
         np.minimum(best[:, 1:], step[:, :-1], out=best[:, 1:])
         np.minimum(best[:, :-1], step[:, 1:], out=best[:, :-1])
         best += cost[i]
         total[i] += best
-        np.subtract(best, best.min(axis=1, keepdims=True), out=here)
+        np.subtract(best, best.min(axis=1, keepdims=True), out=before)
 
 
 @settings
@@ -157,7 +148,7 @@ class CensusMatcher:
         block_px: side of the block over which costs are summed, odd; 1 is none. It sets the
             noise: on synthetic dots the RMS is 0.24 px (1), 0.09 (5), 0.06 (7).
         small_step, large_step: P1 and P2 in bits.
-        paths: 4 or 8; 0 chooses by block costs alone.
+        paths: 4; 0 chooses by block costs alone.
         uniqueness_percent: every other cost but the neighbours' is more than this above the
             best.
         max_difference_px: how far the whole disparities found from `image` and from `other` may
@@ -173,7 +164,7 @@ class CensusMatcher:
     block_px: Annotated[int, Ge(1), IsOdd] = 7
     small_step: NotNegative = 6.0
     large_step: NotNegative = 40.0
-    paths: Literal[0, 4, 8] = 8
+    paths: Literal[0, 4] = 4
     uniqueness_percent: NotNegative = 5.0
     max_difference_px: int = 1
     min_texture: NotNegative = 2.0
@@ -276,7 +267,6 @@ class CensusMatcher:
             cost >> np.uint16(drop) if drop else cost,
             round(self.small_step * area) >> drop,
             round(self.large_step * area) >> drop,
-            self.paths,
         )
 
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from annotated_types import Ge, Interval
 
-from qs3.utils.settings import Count, Share, settings
+from qs3.utils.settings import Count, settings
 
 
 @settings
@@ -29,8 +29,6 @@ class Speckle:
         fill: share of lit positions (the released slide: 0.111).
         spacing: lit positions keep at least this distance (in positions, Chebyshev).
         seed: of the pattern; a device has one pattern, so it belongs to the sensor.
-        brightness_spread: lit dots have a brightness uniform in 1 - spread .. 1, as those of a
-            diffractive element have (Reichinger 2011, of Kinect v1).
     """
 
     columns: Count = 633
@@ -40,7 +38,6 @@ class Speckle:
     fill: Annotated[float, Interval(gt=0, le=0.6)] = 0.111
     spacing: Annotated[int, Ge(0)] = 1
     seed: int = 0
-    brightness_spread: Share = 0.0
 
     @cached_property
     def slide(self) -> np.ndarray:
@@ -49,8 +46,6 @@ class Speckle:
         wanted = round(self.fill * self.rows * self.columns)
         tile = _spaced_dots(self.rows, self.columns, wanted, self.spacing, rng)
         assert 0 < tile.sum() == wanted, f"pattern.fill={self.fill}: {tile.sum()} dots of {wanted}"
-        if self.brightness_spread:
-            tile = tile * (1 - self.brightness_spread * rng.random(tile.shape))
         image = np.tile(tile, (self.tiles, self.tiles))
         return _frozen(image.repeat(self.dot_px, axis=0).repeat(self.dot_px, axis=1))
 
@@ -99,16 +94,12 @@ class ReleasedSlide(Speckle):
 
     Attributes:
         detail: pixels of the slide for each of the picture, after interpolation.
-        brightness_spread: 0, for the picture's dots are all white.
     """
 
     columns: Count = 211
     rows: Count = 165
     tiles: Count = 3
     detail: Count = 2
-
-    def __post_init__(self) -> None:
-        assert not self.brightness_spread, "the released slide's dots are equally bright"
 
     @cached_property
     def slide(self) -> np.ndarray:

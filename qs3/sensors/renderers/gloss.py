@@ -55,29 +55,8 @@ class Gloss:
         return (1 + root) / (1 - root)
 
 
-def times_pi(
-    albedo: float, gloss: Gloss, normal: np.ndarray, i: np.ndarray, o: np.ndarray
-) -> np.ndarray:
-    """[...] pi f(i, o), which is the albedo of a matt surface; unit vectors [..., 3]."""
-    cos_i, cos_o = (np.maximum((normal * way).sum(-1), 1e-9) for way in (i, o))
-    half = i + o
-    half = half / np.linalg.norm(half, axis=-1, keepdims=True)
-    square = gloss.alpha**2
-    facets = square / ((normal * half).sum(-1) ** 2 * (square - 1) + 1) ** 2
-    # 4 cos_i cos_o is in the masking's denominator already.
-    seen = 0.5 / (
-        cos_i * np.sqrt(square + (1 - square) * cos_o**2)
-        + cos_o * np.sqrt(square + (1 - square) * cos_i**2)
-    )
-    shine = facets * seen * fresnel(albedo, gloss, (o * half).sum(-1))
-    kept = np.interp(cos_o, np.linspace(0, 1, COSINES), kept_back(gloss))
-    return (0 if gloss.metal else albedo * (1 - kept)) + shine
-
-
-def fresnel(albedo: float, gloss: Gloss, cosine: np.ndarray) -> np.ndarray:
-    """Share of unpolarised light that a facet reflects, by the cosine of its incidence."""
-    if gloss.metal:
-        return albedo + (1 - albedo) * (1 - cosine) ** 5
+def fresnel(gloss: Gloss, cosine: np.ndarray) -> np.ndarray:
+    """Share of unpolarised light that a dielectric facet reflects, by the cosine of incidence."""
     g = np.sqrt(gloss.refractive_index**2 - 1 + cosine**2)
     other = (cosine * (g + cosine) - 1) / (cosine * (g - cosine) + 1)
     return 0.5 * ((g - cosine) / (g + cosine)) ** 2 * (1 + other**2)
@@ -114,6 +93,6 @@ def kept_back(gloss: Gloss) -> np.ndarray:
         return np.sqrt(1 + alpha**2 * (1 / np.maximum(c, 1e-6) ** 2 - 1)) - 1
 
     passed = (2 + slope_term(cosine)) / (2 + slope_term(cosine) + slope_term(out)) * (out > 0)
-    reflected = fresnel(0.0, gloss, np.clip(met, 0, 1))
+    reflected = fresnel(gloss, np.clip(met, 0, 1))
     mean: np.ndarray = (reflected * passed).sum(axis=1) / passed.sum(axis=1)
     return mean

@@ -38,7 +38,7 @@ class Facets:
         self.cos_o = clip(dr, dr.dot(normal, to_eye), 1e-6, 1)
 
     def times_pi(self, to_light: Any) -> Any:
-        """Pi f of the facets alone; see `gloss.times_pi`."""
+        """Pi f of the facets alone."""
         dr, square = self._dr, self._square
         cos_i = clip(dr, dr.dot(self._normal, to_light), 1e-6, 1)
         half = dr.normalize(to_light + self._to_eye)

@@ -8,7 +8,6 @@ from qs3.sensors.devices.fitted import FittedDepth
 
 POSE = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
 FLAT = np.full((300, 400), 2.0, np.float32)
-FACING = np.ones((300, 400), np.float32)
 
 
 @settings(max_examples=15, deadline=None)
@@ -17,7 +16,7 @@ def test_noise_and_bias_follow_their_laws(depth, floor, factor, power):
     sensor = FittedDepth(
         noise_floor_m=floor, noise_factor=factor, noise_power=power, bias_m=(0.01, -0.002)
     )
-    found, _ = sensor.measure(FLAT / 2 * np.float32(depth), FACING, np.random.default_rng(0))
+    found, _ = sensor.measure(FLAT / 2 * np.float32(depth), np.random.default_rng(0))
     law = floor + factor * depth**power
     assert sensor.noise_law_m(depth) == pytest.approx(law)
     assert found.std() == pytest.approx(law, rel=0.02)
@@ -27,17 +26,17 @@ def test_noise_and_bias_follow_their_laws(depth, floor, factor, power):
 def test_steps_are_of_one_size_in_what_they_are_said_to_be():
     slope = np.linspace(1, 3, 120_000, dtype=np.float32).reshape(300, 400)
     rng = np.random.default_rng(0)
-    inverse, _ = FittedDepth(inverse_step_per_m=0.003).measure(slope, FACING, rng)
+    inverse, _ = FittedDepth(inverse_step_per_m=0.003).measure(slope, rng)
     steps = 1 / inverse / np.float32(0.003)
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-3)
-    whole, _ = FittedDepth(depth_step_m=0.01).measure(slope, FACING, rng)
+    whole, _ = FittedDepth(depth_step_m=0.01).measure(slope, rng)
     np.testing.assert_allclose(whole * 100, np.rint(whole * 100), atol=1e-3)
 
 
 @pytest.mark.parametrize("size", [0.0, 0.8, 2.5])
 def test_neighbours_share_noise_as_stated(size):
     sensor = FittedDepth(correlation_px=size)
-    error = sensor.measure(FLAT, FACING, np.random.default_rng(1))[0] - 2
+    error = sensor.measure(FLAT, np.random.default_rng(1))[0] - 2
     across = np.corrcoef(error[:, 1:].ravel(), error[:, :-1].ravel())[0, 1]
     down = np.corrcoef(error[1:].ravel(), error[:-1].ravel())[0, 1]
     expected = np.exp(-1 / (4 * size**2)) if size else 0.0
@@ -45,9 +44,6 @@ def test_neighbours_share_noise_as_stated(size):
     assert down == pytest.approx(expected, abs=0.02)
 
 
-def test_fill_rates_are_interpolated_over_the_tilt():
-    sensor = FittedDepth(tilts_deg=(0, 60), fill_rates=(0.95, 0.35))
-    for tilt, rate in ((0, 0.95), (30, 0.65), (60, 0.35), (80, 0.35)):
-        cosine = np.full(FLAT.shape, np.cos(np.deg2rad(tilt)), np.float32)
-        found, _ = sensor.measure(FLAT, cosine, np.random.default_rng(0))
-        assert np.isfinite(found).mean() == pytest.approx(rate, abs=0.005)
+def test_so_many_pixels_are_filled():
+    found, _ = FittedDepth(fill_rate=0.65).measure(FLAT, np.random.default_rng(0))
+    assert np.isfinite(found).mean() == pytest.approx(0.65, abs=0.005)

@@ -76,14 +76,13 @@ def path_costs(cost, small, large, step):
     return np.array([[at(row, col) for col in range(width)] for row in range(height)])
 
 
-@pytest.mark.parametrize("paths", [4, 8])
-def test_path_sums_equal_a_recursion_by_hand(paths, monkeypatch):
-    cost = np.random.default_rng(paths).integers(0, 90, (6, 7, 4)).astype(np.uint16)
-    steps = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)][:paths]
+def test_path_sums_equal_a_recursion_by_hand(monkeypatch):
+    cost = np.random.default_rng(4).integers(0, 90, (6, 7, 4)).astype(np.uint16)
+    steps = [(0, 1), (0, -1), (1, 0), (-1, 0)]
     by_hand = sum(path_costs(cost, 5, 31, step) for step in steps)
-    np.testing.assert_array_equal(aggregate(cost, 5, 31, paths), by_hand)
+    np.testing.assert_array_equal(aggregate(cost, 5, 31), by_hand)
     monkeypatch.setattr("qs3.sensors.matching.census.STRIP_ROWS", 4)  # however rows are cut
-    np.testing.assert_array_equal(aggregate(cost, 5, 31, paths), by_hand)
+    np.testing.assert_array_equal(aggregate(cost, 5, 31), by_hand)
 
 
 def test_the_best_place_of_the_other_image_is_read_along_the_diagonals():

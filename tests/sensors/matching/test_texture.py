@@ -42,7 +42,7 @@ def test_a_dim_pair_with_dots_matches_and_a_bright_one_without_does_not():
     pair = [quiet.expose(np.roll(dim, -shift, axis=1), 1.0, rng) for shift in (0, 9)]
     bright = [CAMERA.expose(np.full((60, 200), 220.0, np.float32), 1.0, rng) for _ in range(2)]
     inner = (slice(10, -10), slice(40, -20))
-    common = {"num_disparities": 24, "paths": 4}
+    common = {"num_disparities": 24}
     by_noise = CensusMatcher(**common, min_texture=0.0, texture=asked)
     by_grey = CensusMatcher(**common, min_texture=2.0)
     found = by_noise.match(*pair).disparity[inner]

@@ -11,7 +11,7 @@ from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.renderers.base import AreaLight, Projector, RendererSettings, Scene, tangents
 from qs3.sensors.renderers.blender import BlenderRenderer
-from qs3.sensors.renderers.gloss import COSINES, Gloss, kept_back, times_pi
+from qs3.sensors.renderers.gloss import COSINES, Gloss, fresnel, kept_back
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.sensors.renderers.scenes import moved, octahedron, quad, wall
 
@@ -26,6 +26,28 @@ def mitsuba():
     if renderer.variant.startswith("scalar_"):
         pytest.skip("no compiled variant works here")
     return renderer
+
+
+def times_pi(albedo, gloss, normal, i, o):
+    """[...] pi f(i, o) by the formula of `gloss`; unit vectors [..., 3]."""
+    cos_i, cos_o = (np.maximum((normal * way).sum(-1), 1e-9) for way in (i, o))
+    half = unit(i + o)
+    square = gloss.alpha**2
+    facets = square / ((normal * half).sum(-1) ** 2 * (square - 1) + 1) ** 2
+    # 4 cos_i cos_o is in the masking's denominator already.
+    seen = 0.5 / (
+        cos_i * np.sqrt(square + (1 - square) * cos_o**2)
+        + cos_o * np.sqrt(square + (1 - square) * cos_i**2)
+    )
+    met = (o * half).sum(-1)
+    if gloss.metal:
+        return facets * seen * (albedo + (1 - albedo) * (1 - met) ** 5)
+    kept = np.interp(cos_o, np.linspace(0, 1, COSINES), kept_back(gloss))
+    return albedo * (1 - kept) + facets * seen * fresnel(gloss, met)
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def sky(count=160):
@@ -84,10 +106,6 @@ def tilted_plane(gloss, albedo=0.4):
     points = np.stack([x * z, y * z, z], axis=-1)
     normal = np.array([0.2, 0, -1]) / np.hypot(0.2, 1)
     return body, camera, points, normal
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 @pytest.mark.parametrize("gloss", GLOSSES)
