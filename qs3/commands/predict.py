@@ -55,12 +55,11 @@ def predict(
     right, y down, z forward), at any length; -y is a level camera. Without it the planes of the
     picture tell, else the camera counts as level.
 
-    A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status,
-    class, confidence, second (the class by another net), label, points, dropped (NaN, infinite or
-    0 0 0: without depth), tier (clean, hard, or poor), caution, up, out_of_range (unlike the clouds
-    of training), reason, and p_<class> of each class. An object of no known class also gets a
-    class, often with high confidence. A damaged file gets status=failed and its reason, and the
-    others go on; the exit status is then 1.
+    A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), second (the
+    class by another net), dropped (points NaN, infinite or 0 0 0: without depth), tier (clean,
+    hard, or poor), out_of_range (unlike the clouds of training), ... An object of no known class
+    also gets a class, often with high confidence. A damaged file gets status=failed and its reason,
+    and the others go on; the exit status is then 1.
 
     Example:
         qs3 predict scans ckpt=logs/own_scans/seed0-5f0c2a71

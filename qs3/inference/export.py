@@ -62,18 +62,12 @@ class Comparison:
 
     Where two neighbours or farthest points are equally far but for their last digits, a net may
     take the other one: that happens to single clouds, an error to all.
-
-    Attributes:
-        clouds: compared.
-        typical: the median over the clouds of the largest difference of a cloud's logits.
-        largest: the largest of all.
-        odd: clouds that differ by more than `ALLOWED`.
     """
 
     clouds: int
-    typical: float
+    typical: float  # median over the clouds of the largest difference of a cloud's logits
     largest: float
-    odd: int
+    odd: int  # clouds that differ by more than `ALLOWED`
 
     @classmethod
     def of(cls, theirs: Float[np.ndarray, "n c"], ours: Float[np.ndarray, "n c"]) -> Comparison:
@@ -263,8 +257,7 @@ def metadata(predictor: Predictor) -> dict[str, str]:
         "normalisation": f"subtract the mean of the points{scaling}",
         "sampling": f"then farthest point sampling to {predictor.points} points, from the first "
         "one on",
-        "input": f"{INPUT}: float32 [clouds, points, 3]",
-        "output": f"{OUTPUT}: float32 [clouds, {len(predictor.classes)}], before the softmax",
+        "output": f"{OUTPUT}, before the softmax",
     }
 
 

@@ -1,10 +1,4 @@
-"""Using a trained classifier: `qs3.load(run)(clouds)`.
-
-    predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
-    probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up
-    objects = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
-    predictor = qs3.load("dgcnn-rooms")  # in_metres, and needs_floor
-    probabilities = predictor([cloud_a, cloud_b], floor=0.0)  # z of the floor, in metres
+"""Using a trained classifier: `qs3.load(run)(clouds)`, which is `load` here.
 
 A cloud goes the way of the target's clouds in the run: it is brought to as many points as these
 were stored with (`resample`); put into the unit ball, or of a net that sees metres only centred, or
