@@ -34,9 +34,7 @@ def let_waiting_threads_sleep() -> None:
 
 def cores() -> list[int]:
     """Numbers of the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
+    return sorted(os.sched_getaffinity(0))
 
 
 def free_cores() -> int:
