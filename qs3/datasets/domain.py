@@ -20,7 +20,7 @@ from qs3.config.location import python_command, typed
 from qs3.datasets.importing import Importer, import_into
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.store.meta import MadeOf, is_begun, is_finished, read_meta
-from qs3.store.store import PointSet, has_variant, open_pointset
+from qs3.store.store import PointSet, open_pointset
 from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
@@ -86,7 +86,8 @@ class Domain:
         if self.twin_of is None or is_finished(own) or is_begun(own):
             return own
         other = self.twin_of.absolute()
-        return other if has_variant(other, self.variant) else own
+        has_variant = is_finished(other) and (other / f"{self.variant}.npy").is_file()
+        return other if has_variant else own
 
     @property
     def label(self) -> str:

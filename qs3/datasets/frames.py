@@ -133,9 +133,8 @@ class CutDataset(Importer):
         for task in tasks:
             note, arrays = parts.read(task.name)
             for i, one in enumerate(note["rows"]):
-                found.append(
-                    Item(ManifestRow(**one), functools.partial(arrays.__getitem__, str(i)))
-                )
+                load = functools.partial(arrays.__getitem__, str(i))
+                found.append(Item(ManifestRow(**one), load))
         found = by_class(found, classes)
         rows = [item.row for item in found]
         report(rows, classes, self.points, self.root)
@@ -152,7 +151,7 @@ class CutDataset(Importer):
         recipe, parts = {"settings": self.settings(), "versions": versions}, PartFiles(work)
         try:
             parts.begin(recipe)
-        except Qs3Error:
+        except (ConfigError, DataError):  # and not a full disk
             log.info("settings, files or versions have changed: the frames are cut anew")
             shutil.rmtree(work)
             parts.begin(recipe)

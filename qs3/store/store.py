@@ -34,7 +34,6 @@ from qs3.store.meta import (
     MadeOf,
     ManifestRow,
     check_rows,
-    is_finished,
     number,
     read_manifest,
     read_meta,
@@ -258,11 +257,6 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         sha256=_content_hash(hashes[variant], classes, kept),
         meta=meta,
     )
-
-
-def has_variant(folder: str | Path, variant: str) -> bool:
-    """Whether a finished dataset lies there that has this array of clouds, by its file's name."""
-    return is_finished(folder) and (Path(folder) / f"{variant}.npy").is_file()
 
 
 def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray, tuple[str, ...]]:
