@@ -12,8 +12,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from functools import cache
-from importlib.util import find_spec
 from typing import Any, Literal, NamedTuple
 
 WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
@@ -77,14 +75,8 @@ def keep_freed_memory() -> bool:
     return all([bool(mallopt(key, value)) for key, value in settings])
 
 
-@cache
-def has_numba() -> bool:
-    """Whether numba is there; callers have another way with the same values."""
-    return find_spec("numba") is not None
-
-
 def compiled(kernel: Callable[..., None]) -> Any:
-    """`kernel`, compiled at the first call for each type: for modules imported where numba is.
+    """`kernel`, compiled at the first call for each type.
 
     What was compiled is kept next to the kernel's file, or in the user's cache.
     """

@@ -1,4 +1,4 @@
-"""Matching by normalised correlation; by compiled loops where numba is, with the same values."""
+"""Matching by normalised correlation."""
 
 from __future__ import annotations
 
@@ -10,59 +10,7 @@ from annotated_types import Ge
 
 from qs3.sensors.matching.base import Match
 from qs3.sensors.optics.visibility import Reason, first_reason
-from qs3.utils.processor import has_numba
 from qs3.utils.settings import IsOdd, settings
-
-
-def correlation(
-    product: np.ndarray,
-    means: tuple[np.ndarray, np.ndarray],
-    spreads: tuple[np.ndarray, np.ndarray],
-    out: np.ndarray,
-) -> None:
-    """Normalised correlation of two images' windows.
-
-    Args:
-        product: [h, w] float32, mean of the windows' product.
-        means, spreads: [h, w] float32 each, of one image's windows and of the other's.
-        out: [h, w] float32, gets it.
-    """
-    if has_numba():
-        from qs3.sensors.matching.numba_kernels import to_correlation
-
-        to_correlation(product, *means, *spreads, out)
-    else:
-        out[:] = (product - means[0] * means[1]) / (spreads[0] * spreads[1])
-
-
-def winner(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The highest of the scores [n, h, w] float32 without NaN of each pixel.
-
-    Returns:
-        [h, w] integers, the first place that has it; [4, h, w] float32: the score, its two
-        neighbours' (at an end of the search its own), and the highest more than 2 places away,
-        at least -1.
-    """
-    if not has_numba():
-        return _winner_by_numpy(scores)
-    from qs3.sensors.matching.numba_kernels import best_and_second
-
-    place = np.empty(scores.shape[1:], dtype=np.int32)
-    beside = np.empty((4, *place.shape), dtype=np.float32)
-    best_and_second(scores, place, beside)
-    return place, beside
-
-
-def _winner_by_numpy(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    last = len(scores) - 1
-    place = scores.argmax(axis=0)
-    around = [place, np.maximum(place - 1, 0), np.minimum(place + 1, last)]
-    found = [np.take_along_axis(scores, index[None], axis=0)[0] for index in around]
-    # The runner-up: blank the winner's neighbourhood and look again.
-    others = scores.copy()
-    for near in range(-2, 3):
-        np.put_along_axis(others, np.clip(place + near, 0, last)[None], -1, axis=0)
-    return place, np.stack([*found, others.max(axis=0)])
 
 
 @settings
@@ -95,9 +43,13 @@ class ReferenceMatcher:
 
     def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
         """Disparities; see `Matcher.match`."""
+        from qs3.sensors.matching.numba_kernels import best_and_second
+
         scores = self._scores(image, other.astype(np.float32, copy=False), first)
         last = len(scores) - 1
-        best, (top, lower, upper, second) = winner(scores)
+        best = np.empty(image.shape, dtype=np.int32)
+        top, lower, upper, second = beside = np.empty((4, *image.shape), dtype=np.float32)
+        best_and_second(scores, best, beside)
         inner = (best > 0) & (best < last)
         unique = top - second >= self.uniqueness
         valid = inner & (top >= self.min_score) & unique
@@ -116,6 +68,8 @@ class ReferenceMatcher:
 
     def _scores(self, image: np.ndarray, reference: np.ndarray, first: int) -> np.ndarray:
         """[num_disparities, h, w] float32 normalised correlation; -1 outside the reference."""
+        from qs3.sensors.matching.numba_kernels import to_correlation
+
         size = (self.window_px, self.window_px)
         height, width = image.shape
         whole = reference.shape[1]
@@ -146,5 +100,5 @@ class ReferenceMatcher:
             product = mean(grey[:, here] * reference[:, there])
             means = mean_i[:, here], mean_r[:, there]
             spreads = spread_i[:, here], spread_r[:, there]
-            correlation(product, means, spreads, score[:, here])
+            to_correlation(product, *means, *spreads, score[:, here])
         return scores

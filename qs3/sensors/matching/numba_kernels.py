@@ -1,4 +1,4 @@
-"""Loops over scores of disparities, compiled by numba. Imported where numba is."""
+"""Loops over scores of disparities, compiled. Imported only when needed: numba is slow to load."""
 
 from __future__ import annotations
 
