@@ -7,8 +7,7 @@ on the device. So there is nothing that the number of workers could change.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Int
@@ -36,13 +35,10 @@ def balanced(classes: Int[Tensor, " n"], generator: torch.Generator) -> Int[Tens
     return order
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """An epoch that is not one pass over the data but a piece of a longer way through them.
 
-    Attributes:
-        way: which one; two phases of a run take different ways.
-        first, stop: its batches, counted from the way's beginning.
+    Batches `first` to `stop`, counted from the way's beginning; phases take different ways.
     """
 
     way: int

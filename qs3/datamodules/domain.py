@@ -61,9 +61,8 @@ class DomainData(LightningDataModule):
         sha256: of the dataset, after `setup`.
 
     Raises:
-        ConfigError: no such domain, or no clouds of such a scale; labels are asked for and there
-            are none.
-        DataError: no clouds for training.
+        ConfigError, DataError: no such domain, no clouds for training or of such a scale, no labels
+            where they are asked for.
         MissingDataError: from `prepare_data`, if there are no files; says how to get them.
     """
 

@@ -42,17 +42,11 @@ def farthest_points(
     cache_dir: Path | None = None,
     key: str = "",
 ) -> Int[np.ndarray, "n starts count"] | None:
-    """`starts` samples of `count` farthest points of each cloud; None if `count` is p.
+    """`starts` samples of `count` farthest points of each stored cloud; None if `count` is p.
 
     Sample 0 begins at point 0, the others at points that are a function of the cloud's bytes
-    (`start_points`). Nothing is random, so evaluation is deterministic.
-
-    Args:
-        points: clouds as stored.
-        count: points to keep, at most p.
-        starts: samples of each cloud; at most p are taken.
-        cache_dir: where to keep the indices for the next run; None keeps nothing.
-        key: names the clouds: the dataset with its hash, and the split.
+    (`start_points`). Nothing is random, so evaluation is deterministic. `cache_dir` keeps the
+    indices for the next run, under a `key` that names the dataset with its hash, and the split.
 
     Raises:
         ConfigError: the clouds have fewer points than asked for.

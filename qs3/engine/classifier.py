@@ -27,16 +27,13 @@ _PER_EPOCH: dict[str, Any] = dict(
 
 
 class Classifier(LightningModule):
-    """Trains a net over all phases of a run.
+    """Trains a net over all phases of a run, each of which has its own schedule.
 
     Args:
         build_net: makes a net, [B, N, 3] to logits [B, C], drawing its weights from torch's
             global generator.
         build_optimizer: makes the optimiser of given parameters.
-        method: loss of the warm-up.
-        student: loss of the rounds.
-        phases: which epoch belongs to which phase; each phase has its own schedule.
-        seed: of the run.
+        method, student: losses of the warm-up and of the rounds.
         schedule: of the learning rate, "cosine" or "plateau".
         smoothing: of class labels, see `qs3.methods.base.class_loss`.
         metres: whether clouds keep their size.

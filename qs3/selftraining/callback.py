@@ -51,12 +51,8 @@ class WarmupSelection(Callback):
 
     Never looks at the target. They become `warmup_selected.pt`, the last ones `warmup_last.pt`.
 
-    Args:
-        folder: of the run.
-        phases: of the run.
-        rule: "source_val" as above, "last", or "given": those that the warm-up began with.
-
     Attributes:
+        rule: "source_val" as above, "last", or "given": those that the warm-up began with.
         epoch: of the weights that are kept; -1: from before the first one.
     """
 
@@ -100,12 +96,6 @@ class WarmupSelection(Callback):
 
 class SelfTraining(Callback):
     """Selects pseudo-labels between phases and starts each round afresh.
-
-    Args:
-        folder: of the run.
-        phases: of the run.
-        scheme: settings of the rounds.
-        classes: names in label order.
 
     Attributes:
         records: what `metrics.json` says about each round so far.

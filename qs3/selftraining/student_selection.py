@@ -44,12 +44,8 @@ class StudentSelection(Callback):
 
     It belongs behind `SelfTraining`, whose last selection it divides, and before the checkpoint.
 
-    Args:
-        folder: of the run.
-        phases: of the run.
-        rule: one of `validators.STUDENT_RULES`.
-
     Attributes:
+        rule: one of `validators.STUDENT_RULES`.
         scores: by epoch, of those of the last round so far; none with `last`.
         epoch, score: the best so far; None before there is one.
         held_out: positions in the target's training clouds [h], and their pseudo-labels [h].

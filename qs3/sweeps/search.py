@@ -37,8 +37,10 @@ from qs3.config.compose import quoted
 from qs3.config.location import typed
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
+from qs3.runs.metrics import read_metrics
 from qs3.sweeps.plugins import ListedJobs, OverLauncher, RayLauncher
-from qs3.training.provenance import check_finished
+from qs3.training.provenance import refuse_changed
+from qs3.training.run import run_of
 from qs3.utils.locks import locked
 from qs3.utils.text_table import aligned
 
@@ -133,7 +135,9 @@ class LabelFreeSearch(OverLauncher):
 
         for trial in study.get_trials(states=(TrialState.COMPLETE,)):
             cfg = self._composed([*fixed, *_overrides(words(trial.params))])
-            if check_finished(cfg):
+            run = run_of(cfg)
+            if (metrics := read_metrics(run.folder)) is not None:
+                refuse_changed(run, metrics)
                 return
 
     def _composed(self, overrides: Sequence[str]) -> DictConfig:

@@ -100,7 +100,8 @@ class SummaryOfSeeds(Callback):
     def _summarise(self) -> None:
         if self.journal is None or os.getpid() != self._main:
             return
-        jobs = sorted(last_words(self._read()), key=lambda job: job.get("job", 0))
+        last = {(entry["folder"], *entry["overrides"]): entry for entry in self._read()}
+        jobs = sorted(last.values(), key=lambda job: job["job"])
         self.journal.unlink(missing_ok=True)
         self.journal = None
         folders = list(dict.fromkeys(Path(job["folder"]) for job in jobs))
@@ -121,19 +122,8 @@ class SummaryOfSeeds(Callback):
             return []
 
 
-def last_words(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """A journal's last entry of each job, in the order in which the jobs began."""
-    last: dict[tuple[str, ...], Mapping[str, Any]] = {}
-    for entry in entries:
-        last[entry["folder"], *entry["overrides"]] = entry
-    return list(last.values())
-
-
 def failures(jobs: Sequence[Mapping[str, Any]]) -> str:
-    """The jobs that failed, by error; "" if there are none.
-
-    A job's "error" is "" if it went well, and missing if it never ended.
-    """
+    """The jobs that failed, by error: "" if a job went well, and missing if it never ended."""
     by_error: dict[str, list[str]] = {}
     for job in jobs:
         if job.get("error") != "":

@@ -71,11 +71,6 @@ class SavedNets:
 
     Equal weights are one net, and each net predicts the same clouds once: without rounds, for one,
     the reported weights are those of the warm-up, and its last ones the student's.
-
-    Args:
-        run: whose they are.
-        loaded: clouds, and the target's for norms and a prior that follow them.
-        built: how a net is made, and where it runs.
     """
 
     def __init__(self, run: Run, loaded: Loaded, built: Built) -> None:

@@ -82,11 +82,7 @@ def fit(run: Run) -> tuple[Loaded, Built]:
 
 
 def _build(run: Run, method: Method, loaded: Loaded, given: Result | None, began: Moment) -> Built:
-    """Everything that `Trainer.fit` needs but the data.
-
-    `loaded`: for class names, and the hash of what the warm-up depends on; `given`: the classifier
-    to begin with; `began`: when the run started.
-    """
+    """Everything that `Trainer.fit` needs but the data."""
     cfg, folder, phases = run.cfg, run.folder, run.phases
     classifier = _classifier(run, method, given)
     warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
@@ -203,12 +199,7 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
 
 
 def settle_process(threads: int, float32_matmul: str = "highest") -> None:
-    """What a training sets for its whole process: memory is kept, no tensor is filled in vain.
-
-    Args:
-        threads: of torch.
-        float32_matmul: see `torch.set_float32_matmul_precision`.
-    """
+    """What a training sets for its whole process: memory is kept, no tensor is filled in vain."""
     keep_freed_memory()
     # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]

@@ -187,16 +187,11 @@ def objects_by_id(rows: Sequence[ManifestRow], domain: Domain) -> dict[str, str]
 
 
 def check_real_sizes(target: str, source: Clouds, *parts: Clouds) -> None:
-    """Compare a target's clouds with the labelled ones, if the net sees sizes.
+    """Compare parts of a target's clouds with the labelled ones, if the net sees sizes.
 
     That they are in metres is the user's word (`unit`, `floor_m`). Files in millimetres would train
     without an error, on a target of which the net then predicts one class. A floor that half of the
     clouds reach through is a warning.
-
-    Args:
-        target: the domain's name, for messages.
-        source: the labelled clouds.
-        parts: the target's, such as those for training and for test.
 
     Raises:
         DataError: more than half of a part are more than ten times as large as any labelled cloud,

@@ -25,10 +25,10 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from qs3.config import hashing
 from qs3.errors import MissingDataError
 from qs3.runs import folder as runs
-from qs3.runs.metrics import RunMetrics, read_metrics
+from qs3.runs.metrics import RunMetrics
 from qs3.store.meta import is_finished
 from qs3.store.store import PointSet
-from qs3.training.run import Run, run_of
+from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers, sha256_file
 from qs3.utils.version import VERSION, commit
 
@@ -126,19 +126,6 @@ PACKAGES = (
 _GROUPS = ("data", "model", "method", "protocol", "callbacks", "selftraining")
 _QS3 = "qs3's code"
 _VERSIONED = ("qs3.", "torch.", "lightning.")  # by `PACKAGES`, or by their versions
-
-
-def check_finished(cfg: DictConfig) -> bool:
-    """Whether the run that `cfg` describes is finished.
-
-    Raises:
-        DataError, ConfigError: it is, and its data, its classifier or its settings have changed.
-    """
-    run = run_of(cfg)
-    metrics = read_metrics(run.folder)
-    if metrics is not None:
-        refuse_changed(run, metrics)
-    return metrics is not None
 
 
 def refuse_changed(run: Run, metrics: RunMetrics) -> None:

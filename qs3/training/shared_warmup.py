@@ -55,12 +55,8 @@ def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
 class SharedWarmup(Checkpoint):
     """Gives a run's warm-up to others, and takes theirs; behind `SaveLast` among the callbacks.
 
-    Args:
-        folder: of the run.
-        shared: `paths.warmup_dir`; None shares nothing.
-        sha256: of the warm-up.
-        seed: of the run.
-        warmup: epochs of the warm-up; of a single one nothing is worth sharing.
+    `shared`: `paths.warmup_dir`, None shares nothing; `warmup`: epochs of the warm-up, of a single
+    one nothing is worth sharing.
     """
 
     def __init__(
