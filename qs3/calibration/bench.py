@@ -129,7 +129,7 @@ def _line(name: str, rows: pd.DataFrame, bands: Sequence[Band]) -> dict[str, obj
 
 @dataclass(frozen=True)
 class Band:
-    """What is asked of one sensor: `value` within `low` and `high`; NaN does not hold."""
+    """What is asked of one sensor: `value` within `low` and `high`; NaN is not."""
 
     sensor: str
     band: str
@@ -139,7 +139,7 @@ class Band:
 
     @property
     def holds(self) -> bool:
-        """Whether it is so."""
+        """Whether the value lies within the limits."""
         return self.low <= self.value <= self.high
 
 

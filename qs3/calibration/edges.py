@@ -63,7 +63,10 @@ def measure(subject: Subject, renderer: Renderer, frames: int = 8) -> dict[str, 
             out |= {f"{key}_left_px": float(left), f"{key}_right_px": float(right)}
     if "camera" in found:
         out["camera_expected_px"] = shadow
-    source_m = subject.source_m(cameras=2 if "camera" in found else 1)
+    # Of two cameras the projector is in the middle, one has it at the end of the baseline.
+    source_m = getattr(subject.sensor, "lamp_offset_m", None)
+    if subject.baseline_m is not None:
+        source_m = subject.baseline_m / (2 if "camera" in found else 1)
     if source_m is not None:
         out["projector_expected_px"] = k.focal_px * source_m * (1 / near_m - 1 / far_m)
     edges = np.concatenate(found["edge"])

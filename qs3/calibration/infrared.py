@@ -17,14 +17,13 @@ from scipy.optimize import least_squares
 
 from qs3.config.compose import composed
 from qs3.config.hydra import build
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, DataError
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.gradients import Pair, Twin, View, blurred, exposed, settings_of
 from qs3.sensors.optics.infrared import InfraredCamera
 
 KEYS = ("ambient", "infrared.psf_px", "infrared.read_noise_e")
-_SIDE_PX = 320  # of the plane that the twin shows
 _SMOOTH_PX = 12.0  # standard deviation of the Gaussian that is taken for shading
 _LAGS = 4
 _ERROR = 0.02  # by which statistics of pictures of other dots differ, relative
@@ -62,10 +61,10 @@ def fit_light(
     wanted = torch.stack([_compared(*pair) for pair in pairs]).mean(dim=0)
     twin = Twin(_facing(base, distance_m), fine=3)
     start = settings_of(twin.pair, 1.0)
-    camera, zero = base.infrared, torch.zeros((), dtype=torch.float64)
+    camera = base.infrared
     assert isinstance(camera, InfraredCamera), "the base has no linear camera"
     with torch.no_grad():
-        projected, _ = twin.radiance(start | {"ambient": zero})
+        projected, _ = twin.radiance(start | {"ambient": torch.zeros(())})
     off_grey = float(np.mean([image.mean() for image in dark]))
     first = [max(float(start[key]), least) for key, least in zip(KEYS, (0.01, 0.3, 1), strict=True)]
 
@@ -99,7 +98,7 @@ def _compared(on: torch.Tensor, off: torch.Tensor) -> torch.Tensor:
 
 def _facing(base: SpeckleStereo, distance_m: float) -> Pair:
     """A white plane that faces the cameras, a square of pixels in the middle of the view."""
-    k, side = base.intrinsics, _SIDE_PX
+    k, side = base.intrinsics, 320
     window = Window((k.width_px - side) // 2, (k.height_px - side) // 2, side, side)
     one = torch.ones(side, side, dtype=torch.float64)
     plane = torch.stack([0 * one, 0 * one, one / distance_m], dim=-1)
@@ -115,9 +114,7 @@ def fit_pictures(folder: Path, base: str, distance_m: float) -> str:
     sensor = build(composed(None, f"+sensor={base}").sensor)
     if not isinstance(sensor, SpeckleStereo):
         raise ConfigError(f"base={base} is not an active stereo camera")
-    sides = [side for side in ("left", "right") if (folder / f"{side}.png").exists()]
-    if not sides:
-        raise MissingDataError(f"images={folder} has no left.png")
+    sides = ["left", "right"] if (folder / "right.png").exists() else ["left"]
     lit = [_grey(folder / f"{side}.png") for side in sides]
     dark = [_grey(folder / f"{side}_off.png") for side in sides]
     values, errors = fit_light(sensor, lit, dark, distance_m)
@@ -142,5 +139,5 @@ def _grey(path: Path) -> np.ndarray:
     """[h, w] float64, 0..255, of a picture of 8 or 16 bits."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise DataError(f"{path} is not a picture")
+        raise DataError(f"{path} cannot be read as a picture")
     return image.astype(np.float64) / (257 if image.dtype == np.uint16 else 1)

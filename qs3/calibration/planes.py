@@ -222,14 +222,10 @@ def _inner(depth_m: np.ndarray) -> np.ndarray:
 
 
 def fit_plane(depth_m: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Total least squares through [N] points, without the nearest and farthest 0.5 %.
+    """[3] (a, b, c) of 1 / Z = a x + b y + c by total least squares; NaN for fewer than 10 points.
 
-    Args:
-        depth_m: metres along the optical axis, finite.
-        x, y: tangents of the rays, (u - cx) / f and (v - cy) / f.
-
-    Returns:
-        [3] (a, b, c) of 1 / Z = a x + b y + c; NaN for fewer than 10 points.
+    Without the nearest and farthest 0.5 %. `depth_m` [N] is along the optical axis, and `x`, `y`
+    are the tangents of the rays, (u - cx) / f and (v - cy) / f.
     """
     if len(depth_m) < 10:
         return np.full(3, np.nan)

@@ -67,16 +67,6 @@ class Subject:
         # Costs of census windows are averaged over a block.
         return None if window is None else window + getattr(self.matcher, "block_px", 1) - 1
 
-    def source_m(self, cameras: int) -> float | None:
-        """Where the light comes from, along x from the camera; None if it has no place.
-
-        Of two cameras the projector is in the middle, one has it at the end of the baseline.
-        """
-        if self.baseline_m is None:
-            lamp = self._get("lamp_offset_m")
-            return None if lamp is None else float(lamp)
-        return self.baseline_m / cameras
-
     @property
     def margin_px(self) -> int:
         """Pixels to render around what is measured, so that its edge does not matter."""

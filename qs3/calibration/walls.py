@@ -27,9 +27,9 @@ _LEAST_RANGE = 1.3  # of distances, to tell one law from another
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
 _MAX_TRIALS = 20_000
 _CLEAR = 0.75  # mean resultant length of the levels' phases that is a lattice
+# Standard deviation of a normal variable without its outer 2 x 0.5 %, relative to the whole:
+# sqrt(1 - 2 a phi(a) / 0.99) with a = 2.5758.
 _TRIMMED_NORMAL = 0.9616
-"""Standard deviation of a normal variable without its outer 2 x 0.5 %, relative to the whole:
-sqrt(1 - 2 a phi(a) / 0.99) with a = 2.5758."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,8 @@ class Steps:
 def find_steps(walls: Sequence[Wall]) -> Steps:
     """Steps of all measured depths."""
     depths = np.concatenate([wall.depth_m[np.isfinite(wall.depth_m)] for wall in walls])
-    resolution = _resolution(depths)
+    some = depths[:: max(1, len(depths) // 50_000)]
+    resolution = next((step for step in _RESOLUTIONS_M if _are_multiples(some, step)), 0.0)
     rounded = np.rint(depths / resolution) * resolution if resolution else depths
     levels, counts = np.unique(rounded.astype(np.float32), return_counts=True)
     if not resolution and len(levels) > 0.2 * len(depths):
@@ -165,14 +166,9 @@ def find_steps(walls: Sequence[Wall]) -> Steps:
     return Steps(resolution, _lattice(1 / levels, weight, resolution / levels**2))
 
 
-def _resolution(depth_m: np.ndarray) -> float:
-    """The coarsest of some usual steps of which all depths are multiples; 0 if there is none."""
-    some = depth_m[:: max(1, len(depth_m) // 50_000)]
-    for step in _RESOLUTIONS_M:
-        phase = some / step
-        if (np.abs(phase - np.rint(phase)) < 0.002 + 3e-7 * phase).mean() > 0.999:
-            return step
-    return 0.0
+def _are_multiples(depth_m: np.ndarray, step: float) -> bool:
+    phase = depth_m / step
+    return bool((np.abs(phase - np.rint(phase)) < 0.002 + 3e-7 * phase).mean() > 0.999)
 
 
 def _lattice(x: np.ndarray, weight: np.ndarray, blur: np.ndarray) -> float:
@@ -249,7 +245,9 @@ def find_noise(walls: Sequence[Wall], steps: Steps) -> Noise:
         for each in np.unique(number):
             inside = number == each
             depth = float(z[inside].mean())
-            variance = _inner_variance(error[inside]) - steps.rounding_per_m(depth) ** 2
+            near, far = np.quantile(error[inside], [0.005, 0.995])
+            inner = error[inside & (error >= near) & (error <= far)]
+            variance = inner.var() / _TRIMMED_NORMAL**2 - steps.rounding_per_m(depth) ** 2
             if inside.sum() >= _LEAST_IN_BIN and variance > 0:
                 bins.append((depth, np.sqrt(variance) * depth**2, np.sqrt(inside.sum())))
     if not bins:
@@ -262,13 +260,6 @@ def find_noise(walls: Sequence[Wall], steps: Steps) -> Noise:
         (floor, factor), misfit = nnls(design * (weight / sigma)[:, None], weight)
         laws.append((misfit, float(floor), float(factor), each))
     return Noise(*min(laws)[1:], _correlation_px(walls, steps), z, sigma)
-
-
-def _inner_variance(values: np.ndarray) -> float:
-    """Variance of a normal law, from the inner 99 % of [N] values."""
-    near, far = np.quantile(values, [0.005, 0.995])
-    inner = values[(values >= near) & (values <= far)]
-    return float(inner.var()) / _TRIMMED_NORMAL**2
 
 
 def _correlation_px(walls: Sequence[Wall], steps: Steps) -> float:
