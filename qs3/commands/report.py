@@ -139,7 +139,6 @@ def compare(
     build: Callable[..., Table],
     *,
     base: Annotated[str, "the row to compare with, or a part of its name"] = "",
-    out: _Out = None,
 ) -> None:
     """Print differences to one row, or the effects of the factors that rows cross.
 
@@ -152,19 +151,16 @@ def compare(
         qs3 report compare table=headline kept=docs/results/headline.csv.gz
     """
     from qs3.report.comparison import against, effects, row_of, text
-    from qs3.report.formats import save
 
     found = build()
     row = row_of(found, base) if base else ""
     differences = against(found, row) if row else effects(found)
-    place = _place(found, out, "compared" if row else "effects")
-    said = save(place, {".md": text(differences, row, markdown=True, table=found)})
-    print(text(differences, row, table=found), said, sep="\n")
+    print(text(differences, row, table=found), end="")
 
 
 def judge(
     *,
-    runs: Annotated[tuple[str, ...], "folders of runs, or of seeds, or patterns"],
+    runs: Annotated[tuple[str, ...], "folders of runs, or of seeds"],
     data: Annotated[Path, "the archive, .npz"],
     part: Annotated[str, "part of the archive (default: judge, if it has one)"] = "",
     floor: Annotated[float | None, "its z in metres, minus the camera's height"] = None,

@@ -19,7 +19,7 @@ from qs3.report.intervals import LEVEL, Interval, difference
 from qs3.report.results import CLOUDS, MESHES, answers_of, data_lines, same_data
 from qs3.report.spec import chosen
 from qs3.report.table import Cell, Table
-from qs3.utils import text_table
+from qs3.utils.text_table import aligned
 
 ALL = "all"
 
@@ -141,14 +141,11 @@ def _difference(name: str, cells: Sequence[Cell], seeds: Sequence[int]) -> Compa
     return Compared(name, subsets, why, first.clusters_are)
 
 
-def text(
-    found: Sequence[Compared], base: str = "", markdown: bool = False, table: Table | None = None
-) -> str:
+def text(found: Sequence[Compared], base: str = "", table: Table | None = None) -> str:
     """A line a row: differences in percentage points, and how many seeds would tell them apart.
 
     Args:
         found: of `against` (with its `base`) or `effects`.
-        markdown: instead of columns for the terminal.
         table: that they are of: its title and what must not be overlooked come first.
     """
     tiers = any(len(one.subsets) > 1 for one in found)
@@ -175,8 +172,7 @@ def text(
     notes += [f"{', '.join(o.name for o in found if o.why == why)}: {why}" for why in whys]
     head = []
     if table:
-        head = [f"{'## ' * markdown}{table.title}", "", *marks(table), ""]
+        head = [table.title, "", *marks(table), ""]
         notes += data_lines(table.lines)
-    layout = text_table.markdown if markdown else text_table.aligned
-    body = layout(rows) if len(rows) > 1 else []
+    body = aligned(rows) if len(rows) > 1 else []
     return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"

@@ -206,10 +206,18 @@ def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
     prior = pd.DataFrame(dict(zip("AB", shares, strict=True))).fillna(0)
     clouds = []
     for one in both:
-        positions = _of_each(one, common, seed)
-        seen = pd.DataFrame([one_cloud(_sampled(one.data.points[i], count)) for i in positions])
-        means = seen[["copies", "lonely"]].mean()
-        clouds.append(seen.median().to_dict() | means.to_dict() | surface(one, positions))
+        positions: list[int] = []
+        for cls in common:
+            rng = np.random.default_rng([seed, 2, one.data.classes.index(cls)])
+            positions += rng.permutation(one.data.members(cls))[:_COMPARED].tolist()
+        seen = []
+        for i in positions:  # as a net sees them
+            ball = unit_ball(np.asarray(one.data.points[i], dtype=np.float32))
+            few = farthest_point_sampling_np(ball, count) if len(ball) > count else slice(None)
+            seen.append(one_cloud(ball[few]))
+        table = pd.DataFrame(seen)
+        means = table[["copies", "lonely"]].mean()
+        clouds.append(table.median().to_dict() | means.to_dict() | surface(one, positions))
     return {
         "a": a.label,
         "b": b.label,
@@ -239,21 +247,6 @@ def surface(opened: Opened, positions: Sequence[int]) -> dict[str, float]:
         seen.append((cKDTree(cloud).query(truth)[0] < WITHIN * radius).mean())
     median, p95 = np.percentile(np.concatenate(off), [50, 95])
     return {"off": float(median), "off_95": float(p95), "measured": float(np.mean(seen))}
-
-
-def _sampled(cloud: np.ndarray, count: int) -> Float[np.ndarray, "m 3"]:
-    """What a net sees: farthest point sampling to `count` points, from the first; unit ball."""
-    cloud = unit_ball(np.asarray(cloud, dtype=np.float32))
-    return cloud[farthest_point_sampling_np(cloud, count)] if len(cloud) > count else cloud
-
-
-def _of_each(opened: Opened, classes: Sequence[str], seed: int) -> list[int]:
-    """Up to 60 clouds of each class, at random."""
-    found: list[int] = []
-    for cls in classes:
-        rng = np.random.default_rng([seed, 2, opened.data.classes.index(cls)])
-        found += rng.permutation(opened.data.members(cls))[:_COMPARED].tolist()
-    return found
 
 
 _GLANCE = {
@@ -290,10 +283,7 @@ def pair_text(facts: Mapping[str, Any]) -> str:
 
 
 def contact_sheet(
-    clouds: Sequence[np.ndarray | None],
-    titles: Sequence[str],
-    columns: int = _ROW,
-    **words: Any,
+    clouds: Sequence[np.ndarray | None], titles: Sequence[str], columns: int = _ROW, **words: Any
 ) -> Figure:
     """A sheet of clouds [P, 3], z up; `words` as of `qs3.utils.pictures.sheet`.
 
@@ -302,12 +292,12 @@ def contact_sheet(
     """
     images: list[Image | None] = []
     for cloud in clouds:
-        if cloud is not None:
-            cloud = np.asarray(cloud, dtype=np.float64)
-            some = cloud[:: max(1, len(cloud) // _POINTS)]
-            images.append(cloud_image(some, _SIDE_PX, AZIMUTH_DEG + turn_deg(cloud)))
-        else:
+        if cloud is None:
             images.append(None)
+            continue
+        cloud = np.asarray(cloud, dtype=np.float64)
+        some = cloud[:: max(1, len(cloud) // _POINTS)]
+        images.append(cloud_image(some, _SIDE_PX, AZIMUTH_DEG + turn_deg(cloud)))
     return sheet(images, titles, columns=columns, **words)
 
 
@@ -324,50 +314,26 @@ def class_sheet(data: PointSet, split: str, heading: str = "") -> Figure:
             shown += [*some, *[None] * (columns - len(some))]
     else:
         shown += drawn(np.arange(len(part)), _SHEET)
-    return contact_sheet(
-        [None if i is None else part.points[i] for i in shown],
-        ["" if i is None else _short(part.ids[i]) for i in shown],
-        columns,
-        heading=heading,
-        rows=rows,
-    )
+    clouds = [None if i is None else part.points[i] for i in shown]
+    titles = ["" if i is None else part.ids[i].rsplit("/", 1)[-1][-22:] for i in shown]
+    return contact_sheet(clouds, titles, columns, heading=heading, rows=rows)
 
 
-def scan_picture(domains: Mapping[str, PointSet], split: str = "train") -> Figure:
-    """One object of each class as each domain has it, two classes a row.
+def scan_picture(domains: Mapping[str, PointSet], split: str) -> Figure:
+    """One object of each class as each domain (by its title) has it, two classes a row.
 
-    Where domains share ids (a cloud and its clean twin, surface samples of the same mesh) the
+    Where all domains have an id (a cloud and its clean twin, surface samples of the same mesh) the
     object is the same; else it is the domain's first of that class.
-
-    Args:
-        domains: by column title, such as "S: SpeckleNet10".
-        split: which split the objects come from.
     """
     sets = [data.split(split) for data in domains.values()]
     classes = sets[0].classes
     half = -(-len(classes) // 2)
-    order = [cls for i in range(half) for cls in classes[i::half]]
     clouds, titles = [], []
-    for cls in order:
-        for cloud in _same_object(sets, cls):
-            clouds.append(cloud)
-            titles.append(cls if cloud is not None else f"no {cls}")
+    for cls in (cls for i in range(half) for cls in classes[i::half]):
+        places = [{data.ids[i]: i for i in data.members(cls)} for data in sets]
+        shared = next((name for name in places[0] if all(name in of for of in places)), None)
+        for data, of in zip(sets, places, strict=True):
+            name = shared or next(iter(of), None)
+            clouds.append(None if name is None else data.points[of[name]])
+            titles.append(cls if of else f"no {cls}")
     return contact_sheet(clouds, titles, 2 * len(sets), heads=[*domains] * 2)
-
-
-def _same_object(sets: Sequence[PointSet], cls: str) -> list[np.ndarray | None]:
-    """A cloud of the class from each set, of the object that most sets have; None if none."""
-    ids = [[data.ids[i] for i in data.members(cls)] for data in sets]
-    everywhere = {name: sum(name in own for own in ids) for own in ids for name in own}
-    best = max(everywhere, key=lambda name: everywhere[name], default=None)
-    found: list[np.ndarray | None] = []
-    for data, own in zip(sets, ids, strict=True):
-        name = best if best in own else next(iter(own), None)
-        found.append(None if name is None else np.asarray(data.points[data.ids.index(name)]))
-    return found
-
-
-def _short(id_: str) -> str:
-    """The end of an id, as a panel has room for."""
-    name = id_.rsplit("/", 1)[-1]
-    return name if len(name) <= 22 else f"…{name[-21:]}"

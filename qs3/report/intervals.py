@@ -37,14 +37,9 @@ _SEEDS = np.arange(2, 1001)
 class Interval:
     """A share in [0, 1], or a difference of two in [-1, 1].
 
-    Attributes:
-        mean: over seeds.
-        sem: standard error over seeds; None for one.
-        low, high: of the interval at `LEVEL`, over clusters alone for one seed; None with a single
-            cluster.
-        seeds, clusters: numbers of each.
-        seeds_needed: so many would make 0 fall outside, if the mean stays as it is; None if no
-            number of seeds would.
+    `mean` is over seeds, `sem` its standard error (None for one). `low` and `high` are the ends at
+    `LEVEL`, over clusters alone for one seed; None with a single cluster. `seeds_needed`: so many
+    would make 0 fall outside, if the mean stays as it is; None if no number of seeds would.
     """
 
     mean: float

@@ -7,7 +7,6 @@ run was trained with. Nothing is trained, chosen or tuned by what comes out.
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from jaxtyping import Bool, Int
 
 from qs3.classes import known_as
 from qs3.datasets.object_archive import JUDGE, TIERS, read_archive
-from qs3.errors import ConfigError, MissingDataError
+from qs3.errors import ConfigError
 from qs3.inference.model_file import FILE, find_result, pretrained_name
 from qs3.inference.predictor import Predictor, load
 from qs3.report.intervals import Interval, difference, share
@@ -86,7 +85,7 @@ def judge(
     Points that the archive marks as stray are left out.
 
     Args:
-        runs: folders of runs, folders of such folders, patterns, or result files.
+        runs: folders of runs, folders of such folders, or result files.
         data: the .npz.
         part: of its `dev`; none: "judge", where it has one, else all.
         floor: z of the floor in the archive, minus its camera's height, for nets that know heights.
@@ -147,22 +146,12 @@ def _load(file: Path, floor: float | None, device: str) -> Predictor:
 
 
 def find_runs(runs: Sequence[str]) -> list[Path]:
-    """The result files that are meant, each once, in order; see `judge`.
-
-    Raises:
-        MissingDataError: one is not there.
-    """
+    """The result files that are meant, each once, in order; see `judge`."""
     found: dict[Path, None] = {}
     for words in runs:
         place = Path(words).expanduser()
-        places = sorted(map(Path, glob.glob(str(place)))) if glob.has_magic(words) else [place]
-        if place.exists():
-            places = [place]
-        if not places:
-            raise MissingDataError(f"runs={words} matches nothing")
-        for one in places:
-            files = sorted(one.rglob(FILE)) if one.is_dir() else []
-            found |= dict.fromkeys(map(find_result, files or [one]))
+        files = sorted(place.rglob(FILE)) if place.is_dir() else []
+        found |= dict.fromkeys(map(find_result, files or [place]))
     return list(found)
 
 

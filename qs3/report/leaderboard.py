@@ -80,4 +80,4 @@ def first_row(table: Table, name: str) -> Table:
 def page(table: Table, name: str) -> str:
     """The table, and the row minus each other row that has runs, paired."""
     found = [one for one in against(table, name, reverse=True) if "not run" not in one.why]
-    return f"{markdown(table)}\n{name} minus\n\n{compared_text(found, markdown=True)}"
+    return f"{markdown(table)}\n{name} minus\n\n```\n{compared_text(found)}```\n"

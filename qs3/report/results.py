@@ -299,29 +299,28 @@ def summarise(folders: Sequence[Path], settings: Mapping[Path, str] | None = Non
     the others.
     """
     differing = [(settings or {}).get(folder, "") for folder in folders]
-    lines = pd.DataFrame([next(load_run(folder)) for folder in folders])
+    lines = pd.DataFrame([next(load_run(folder)) for folder in folders]).assign(settings=differing)
     rows, notes = [], []
-    for key, some in lines.assign(settings=differing).groupby(["experiment", "hash"], sort=False):
+    for key, some in lines.groupby(["experiment", "hash"], sort=False):
         runs = Runs(some)
-        about = ["?"] * 3
+        row = {"experiment": key[0], "settings": some.settings.iloc[0] or "-"}
         if runs.seeds:
             first = runs.finished.iloc[0]
             mark = " (simulated target)" * bool(first.simulated)
-            about = [f"{first.source} -> {first.target}{mark}", first.method, first.selftraining]
-        stats = [runs.stat(name) for name in _NAMES]
-        accuracy, balanced = (stat.percent() if stat else "-" for stat in stats[:2])
-        majority = f"{100 * stats[2].mean:.1f}" if stats[2] else "-"
-        few = " (!)" * (0 < len(runs.seeds) < FEW_SEEDS)
-        shown = (accuracy, balanced, f"{len(runs.seeds)}{few}", majority)
-        rows.append([key[0], some.settings.iloc[0] or "-", *about, *shown])
-        name = " ".join(key)
-        if not runs.finished.empty and not runs.finished.labelled.any():
-            notes.append(f"{name}: no target labels, so no accuracy")
-        notes += [f"{name}, {words}" for words in runs.problems]
+            row["source -> target"] = f"{first.source} -> {first.target}{mark}"
+            row |= {"method": first.method, "self-training": first.selftraining}
+            if not first.labelled:
+                notes.append(f"{' '.join(key)}: no target labels, so no accuracy")
+        for words, name in zip(("accuracy", "balanced", "majority"), _NAMES, strict=True):
+            if stat := runs.stat(name):
+                row[words] = f"{100 * stat.mean:.1f}" if words == "majority" else stat.percent()
+        row["seeds"] = f"{len(runs.seeds)}{' (!)' * (0 < len(runs.seeds) < FEW_SEEDS)}"
+        rows.append(row)
+        notes += [f"{' '.join(key)}, {words}" for words in runs.problems]
     header = ["experiment", "settings", "source -> target", "method", "self-training"]
     header += ["accuracy", "balanced", "seeds", "majority"]
-    notes += [f"(!) fewer than {FEW_SEEDS} seeds"] * any("(!)" in row[-2] for row in rows)
+    table = [header, *([row.get(name, "-") for name in header] for row in rows)]
+    notes += [f"(!) fewer than {FEW_SEEDS} seeds"] * any("(!)" in row["seeds"] for row in rows)
+    notes += data_lines(lines[lines.problem == ""])
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
-    return "\n".join(
-        [caption, *aligned([header, *rows]), *notes, *data_lines(lines[lines.problem == ""])]
-    )
+    return "\n".join([caption, *aligned(table), *notes])

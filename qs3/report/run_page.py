@@ -10,10 +10,10 @@ import dataclasses
 import logging
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -51,16 +51,10 @@ _DOMAIN = tuple(field.name for field in dataclasses.fields(Domain))
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """A run, read.
+    """A run's folder, read: what is not there (yet) is None.
 
-    Attributes:
-        folder: of the run.
-        metrics: contents of metrics.json; None if the run is not finished.
-        history: history.csv, one row an epoch; None if no epoch is done.
-        predictions: None if there are none yet.
-        classes: names in label order.
-        config: as composed, not resolved; None if Hydra did not write it.
-        command: that started the run.
+    `history` has a row an epoch, `classes` names in label order; `config` is as composed, not
+    resolved, and `command` started the run.
     """
 
     folder: Path
@@ -160,12 +154,11 @@ def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) ->
     return data
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
+class Drawn(NamedTuple):
     """What became of a run's pictures: PNG by name, reasons by name, and the page."""
 
-    pictures: Mapping[str, Path]
-    skipped: Mapping[str, str]
+    pictures: dict[str, Path]
+    skipped: dict[str, str]
     page: Path
 
 
@@ -197,44 +190,40 @@ def draw(
     if config is not None:
         run = dataclasses.replace(run, config=config)
     out = make_folder(run.folder / FOLDER if out is None else Path(out))
-    charts: dict[str, Callable[[], Figure | str]] = {"curves": lambda: _curves(run)}
-    if embed:
-        charts["embedding"] = lambda: _embedding(run, data_dir, packages)
     pictures: dict[str, Path] = {}
     skipped: dict[str, str] = {}
-    for name, make in charts.items():
+    clouds: dict[str, Any] = {"about": (), "notes": (), "data": None}
+    for name in ("curves", "embedding"):
         path = out / f"{name}.png"
         path.unlink(missing_ok=True)
         try:
-            figure = make()
-        except Qs3Error as error:  # damaged data cost their pictures alone
-            figure = str(error)
-        if isinstance(figure, str):
-            skipped[name] = figure
-        else:
-            save_png(figure, path)
+            if name == "curves":
+                save_png(_curves(run), path)
+            elif embed:
+                save_png(_embedding(run, data_dir, packages), path)
+            else:
+                continue
             pictures[name] = path
-    clouds: dict[str, Any] = {"about": (), "notes": (), "data": None}
+        except Qs3Error as error:  # damaged data cost their pictures alone
+            skipped[name] = str(error)
     try:
         clouds = viewer([worst_clouds(run, _CLOUDS, data_dir=data_dir)], points=_POINTS)
     except Qs3Error as error:
         skipped["clouds"] = str(error)
     m = run.metrics
+    rounds = run_charts.pseudo_labels(m.rounds, run.classes) if m and m.rounds else None
     page = render(
         "run.html",
         title=run.title,
         m=m,
-        teacher=m and chosen_in_words(m.selection.teacher),
-        student=m and m.rounds and chosen_in_words(m.selection.student),
-        expected=m and in_words(m.quality.expected),
+        in_words=in_words,
+        chosen_in_words=chosen_in_words,
         confusion=m
         and m.final.confusion
         and confusion_rows(np.array(m.final.confusion), run.classes),
-        rounds=m
-        and m.rounds
-        and run_charts.pseudo_labels(m.rounds, run.classes).to_html(
-            border=0, float_format="{:.2f}".format, na_rep=""
-        ),
+        rounds=""
+        if rounds is None
+        else rounds.to_html(border=0, float_format="{:.2f}".format, na_rep=""),
         command=run.command,
         pictures=[(name, path.read_bytes()) for name, path in pictures.items()],
         skipped=skipped,
@@ -245,10 +234,9 @@ def draw(
     return Drawn(pictures, skipped, out / PAGE)
 
 
-def _curves(run: RunFiles) -> Figure | str:
-    """Training, or why there is nothing to draw."""
+def _curves(run: RunFiles) -> Figure:
     if run.history is None:
-        return "no epoch is done yet"
+        raise MissingDataError("no epoch is done yet")
     marked = {}
     if m := run.metrics:
         marked = {"teacher": m.warmup.selected.epoch}
@@ -257,7 +245,7 @@ def _curves(run: RunFiles) -> Figure | str:
     return run_charts.curves(f"{run.title}: training", run.history, marked)
 
 
-def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[str]) -> Figure | str:
+def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[str]) -> Figure:
     """PCA of the global features of test clouds of source and target, before and after.
 
     "Before" are the weights that the warm-up selected, "after" those of the result: without rounds
@@ -276,8 +264,6 @@ def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[st
         before = dataclasses.replace(result, weights=load(run.folder / _WARMUP))
         nets = {"after the warm-up": build_net(before, packages),
                 "after self-training": nets["result"]}  # fmt: skip
-    if not all(callable(getattr(net, "features", None)) for net in nets.values()):
-        return "the net has no features"
     parts, labels, names = {}, [], []
     for role, data in sets.items():
         split = "test" if "test" in data.counts() else "train"

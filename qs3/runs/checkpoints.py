@@ -29,7 +29,6 @@ def save(value: Any, path: str | os.PathLike[str]) -> None:
 
     Raises:
         ConfigError: there is another value among them, such as numpy's: `load` would refuse it.
-        Qs3Error: the file cannot be written (permission, full disk).
     """
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         try:

@@ -41,11 +41,7 @@ _OF_A_START = ("train.log", ".lock", STARTED, ".hydra")
 
 
 def read_started(folder: str | Path) -> dict[str, Any] | None:
-    """What `write_started` saved; None if the run never got that far.
-
-    Raises:
-        DataError: the file is damaged.
-    """
+    """What `write_started` saved; None if the run never got that far."""
     path = Path(folder) / STARTED
     try:
         return dict(json.loads(path.read_bytes()))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -19,22 +19,16 @@ from qs3.utils.files import write_text
 from qs3.utils.settings import problems
 
 METRICS = "metrics.json"
-FINISHED: Final = "finished"
 
 _STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Scores:
-    """What a net is worth on the target's evaluated clouds; see `qs3.evaluation.metrics.scores`.
+    """What a net is worth on n evaluated clouds; see `qs3.evaluation.metrics.scores`.
 
-    Attributes:
-        n: clouds.
-        predicted: how many were given to each class, in label order.
-        accuracy, balanced_accuracy, majority_rate: None without labels.
-        per_class_recall: None for a class without clouds.
-        confusion: `[i][j]` counts clouds of class i predicted as j.
-        calibration_error: expected calibration error; None for a net that has diverged.
+    `predicted` counts what was given to each class, in label order, `confusion[i][j]` clouds of
+    class i predicted as j. All else is None without labels.
     """
 
     n: int
@@ -88,14 +82,12 @@ class Evaluated:
 
     Attributes:
         split: "test"; "train" where there is no other.
-        labels: whether anybody knows the clouds' classes.
-        rotations: rotations about the up axis over which the further scores average; 0: none.
-        norms: "trained", "adabn", "alpha_bn" or "tent".
-        prior: how common classes counted as, in words; "": as in training.
-        prior_shares: the same as numbers, of sum 1; None without.
-        final_over_rotations, warmup_over_rotations: those scores.
-        tiers: the final scores of the clouds of each tier, for datasets that have tiers ("clean",
-            "hard": how much of the object is seen) and labels.
+        labels: whether the clouds' classes are known.
+        rotations: about the up axis, over which `..._over_rotations` average; 0: none.
+        norms: as `evaluation.norms`.
+        prior, prior_shares: how common classes counted as, in words and as numbers of sum 1.
+        tiers: the final scores of the clouds of each tier ("clean", "hard": how much of the object
+            is seen), where these and labels are known.
     """
 
     split: str
@@ -122,11 +114,8 @@ class PseudoLabelScores:
 class RoundRecord:
     """One round of self-training, from 0; target clouds by class, and of all classes.
 
-    Attributes:
-        mu, thresholds: by class, where the selector has them.
-        missing_classes: without a pseudo-label.
-        agreement: share of labels as in the round before; None in round 0.
-        with_target_labels: None where these are not known.
+    `mu` and `thresholds` are by class, where the selector has them; `missing_classes` have no
+    pseudo-label; `agreement` is the share of labels as in the round before.
     """
 
     round: int
@@ -146,9 +135,7 @@ class RoundRecord:
 class StudentChoice:
     """How the reported epoch of the last round was chosen, where it is not the last one.
 
-    Attributes:
-        scores: of `selection.student`'s rule by epoch.
-        held_out: clouds that were held out of the last round for it.
+    By the rule's `scores` of each epoch, with so many clouds `held_out` of the round for it.
     """
 
     rule: str
@@ -167,7 +154,7 @@ class Quality:
         validation_accuracy: on held-out labelled clouds.
         expected: accuracy by `qs3.evaluation.expected`, of the net before self-training if there
             was any, with the norms it was trained with: what adapts a net to clouds makes it surer
-            of them. None of a net that has diverged, and of few clouds.
+            of them.
         unlike_source: share of clouds outside the usual range of the labelled ones.
         never_predicted: classes.
     """
@@ -229,7 +216,7 @@ class RunMetrics:
     hash: str
     config_sha256: str
     seed: int
-    status: Literal["finished"] = FINISHED
+    status: Literal["finished"] = "finished"
     source: str
     target: str
     simulated: bool

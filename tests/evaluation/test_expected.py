@@ -34,10 +34,6 @@ def test_the_formula_by_hand() -> None:
     assert in_words(found) == "about 42% expected right (±11)"
 
 
-def test_no_confidence_raises_the_estimate() -> None:
-    assert expected_accuracy(HeldOut(0.8, 1.0), sure(0.99)) == pytest.approx(0.8)
-
-
 def test_of_few_and_of_a_net_that_diverged_nothing_is_said() -> None:
     known = HeldOut(0.8, 1.0)
     assert expected_accuracy(known, sure(0.6, FEWEST - 1)) is None
@@ -50,15 +46,6 @@ def test_of_few_and_of_a_net_that_diverged_nothing_is_said() -> None:
 def test_held_out_counts_one_more_of_each() -> None:
     known = held_out(sure(0.9, 8), np.zeros(8, int))
     assert known.accuracy == pytest.approx(9 / 10)
-
-
-@pytest.mark.parametrize("true", [0.5, 1.0, 3.0])
-def test_the_temperature_of_answers_that_were_scaled_is_found(true: float) -> None:
-    rng = np.random.default_rng(0)
-    right = scaled(rng.dirichlet(np.ones(4), size=20_000), 0.7)
-    labels = (right.cumsum(axis=1) > rng.random((len(right), 1))).argmax(axis=1)
-    found = temperature(scaled(right, 1 / true), labels)
-    assert found == pytest.approx(true, rel=0.05)
 
 
 @given(st.integers(0, 100), st.integers(1, 40), st.integers(2, 5))

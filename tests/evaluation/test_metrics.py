@@ -106,22 +106,3 @@ def test_each_tier_is_scored_by_itself(labelled, tiers):
         "clean": (2, 1.0),  # a and d; c has none
         "hard": (1, 0.0),
     }
-
-
-@pytest.mark.parametrize("rotations", [0, 3])
-@pytest.mark.parametrize("labelled", [True, False])
-def test_turned_scores_stand_beside_the_plain_ones(rotations, labelled):
-    stored = np.random.default_rng(0).normal(size=(5, 6, 3)).astype(np.float32)
-    clouds = Clouds.of(stored, names=tuple("abcde"))
-    labels = torch.tensor([0, 1, 0, 1, 1]) if labelled else None
-    evaluation = Evaluation(clouds, labels, None, ("x", "y"), rotations)
-    first, of_turn = predict(Net(), clouds.points, 2), turned(clouds.points, 2)
-    plain, mean = evaluation.scores_of(first), evaluation.rotation_averaged(of_turn)
-    assert (mean is None) == (rotations == 0)
-    assert (plain.accuracy is None) == (not labelled)
-    predicted = first.argmax(axis=1)
-    assert list(plain.predicted.values()) == np.bincount(predicted, minlength=2).tolist()
-    if mean is not None:
-        assert (mean.n, mean.accuracy is None) == (plain.n, plain.accuracy is None)
-        predicted = rotation_average(of_turn, rotations).argmax(axis=1)
-        assert list(mean.predicted.values()) == np.bincount(predicted, minlength=2).tolist()

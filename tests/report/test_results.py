@@ -1,16 +1,11 @@
 """Runs as a frame: mean and SEM, what must not be averaged, and the file in which they are kept."""
 
-import math
-import statistics
 from dataclasses import replace
 
-import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from qs3.errors import ConfigError, DataError
-from qs3.report.results import Runs, Stat, load_runs, read_kept, summarise
+from qs3.report.results import Runs, load_runs, read_kept, summarise
 from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
 from tests.report.made_runs import CATALOGUE, scores, write_run
 
@@ -19,14 +14,6 @@ def runs(log_dir, take="final"):
     """The runs of the one config in a folder."""
     (found,) = (lines for key, lines in load_runs(log_dir).items() if key[2] == take)
     return Runs(found)
-
-
-@given(st.lists(st.floats(0, 1), min_size=2, max_size=9))
-def test_mean_and_sem_are_those_of_the_standard_library(values):
-    stat = Stat.of(pd.Series(values))
-    assert stat.mean == pytest.approx(statistics.fmean(values), abs=1e-12)
-    assert stat.sem == pytest.approx(statistics.stdev(values) / math.sqrt(len(values)), abs=1e-9)
-    assert Stat.of(pd.Series(values[:1])) == Stat(values[0], None, 1)
 
 
 def test_groups_by_hash_not_by_seed(tmp_path):

@@ -23,7 +23,6 @@ from qs3.runs.checkpoints import save
 from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
 from qs3.runs.predictions import read_predictions, write_predictions
 from qs3.training.command import train
-from qs3.utils.page import confusion_rows
 from tests.report.made_runs import change, not_blank, table
 from tests.report.pages import data_of
 from tests.running import main
@@ -88,18 +87,6 @@ def test_curves_are_the_history(run):
     teacher = read_metrics(run).warmup.selected.epoch
     assert line(axes[0], f"teacher: epoch {teacher + 1}")[0].tolist() == [teacher + 1] * 2
     assert line(axes[1], "student: epoch 9")[0].tolist() == [9, 9]
-
-
-def test_confusion_is_that_of_the_predictions(run):
-    rows = table(run / "predictions.csv")
-    counts = Counter((row["label"], row["predicted"]) for row in rows)
-    found = confusion_rows(np.array(read_metrics(run).final.confusion), CLASSES)
-    assert [row["name"] for row in found] == [*CLASSES]
-    for row in found:
-        want = [counts[row["name"], predicted] for predicted in CLASSES]
-        assert [n for n, _, _ in row["cells"]] == want
-        assert (row["hits"], row["total"]) == (counts[row["name"], row["name"]], sum(want))
-    assert "is \\ called" in draw(run, embed=False).page.read_text()
 
 
 def test_pseudo_labels_are_those_of_the_tables(run):

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import pytest
 
-from qs3.config import hashing
 from qs3.errors import DataError
 from qs3.runs.metrics import METRICS, Evaluated, read_metrics, write_metrics
-from qs3.training.command import train
 from tests.report.made_runs import metrics, scores
 from tests.training.conftest import finished, toy, toy_data  # noqa: F401 (fixtures)
 
@@ -63,13 +60,3 @@ def test_a_damaged_file_is_named(old, new, place, tmp_path):
     with pytest.raises(DataError, match=METRICS) as error:
         read_metrics(tmp_path)
     assert place in str(error.value)
-
-
-def test_training_names_a_damaged_file(toy):  # noqa: F811
-    cfg = toy("selftraining=none")
-    own = hashing.run_folder(cfg)
-    own.mkdir(parents=True)
-    (own / METRICS).write_text(json.dumps({"seed": 0}))
-    with pytest.raises(DataError, match=METRICS):
-        train(cfg)
-    assert (own / METRICS).read_text() == json.dumps({"seed": 0})
