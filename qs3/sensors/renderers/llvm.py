@@ -25,7 +25,6 @@ from qs3.errors import RenderError
 PROBE_VARIABLE = "QS3_MITSUBA_PROBE"
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
-_PREFERRED = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 _FOLDERS = (
     "/usr/lib/*-linux-gnu", "/usr/lib/llvm-*/lib", "/usr/lib64", "/usr/lib64/llvm*/lib",
     "/usr/lib", "/usr/local/lib", "/opt/homebrew/opt/llvm*/lib",
@@ -75,22 +74,18 @@ def cuda_may_work() -> bool:
 
 
 def find_variant(variant: str = "auto") -> Probe:
-    """The variant to use.
+    """The Mitsuba variant to use; RenderError if one that was asked for cannot run here.
 
-    Args:
-        variant: a Mitsuba variant, or "auto": CUDA if there is a GPU that works, else LLVM
-            with the newest libLLVM that works, else `scalar_rgb` (20 to 40x slower).
-
-    Raises:
-        RenderError: the variant that was asked for cannot run here.
+    "auto": CUDA if there is a GPU that works, else LLVM with the newest libLLVM that works, else
+    `scalar_rgb` (20 to 40x slower).
     """
-    if variant == "auto":
-        return _inherited() or _remember(_first_that_works())
-    if variant.startswith("llvm_"):
-        inherited = _inherited()
-        if inherited is None or inherited.variant != variant:
-            return _remember(_probe_llvm(variant))
+    inherited = _inherited()
+    if inherited is not None and variant in ("auto", inherited.variant):
         return inherited
+    if variant == "auto":
+        return _remember(_first_that_works())
+    if variant.startswith("llvm_"):
+        return _remember(_probe_llvm(variant))
     if variant.startswith("cuda_"):
         reason = "no libcuda found" if not cuda_may_work() else try_variant(variant, None)
         if reason is not None:
@@ -127,17 +122,15 @@ def try_variant(variant: str, llvm_path: str | None) -> str | None:
 
 
 def _first_that_works() -> Probe:
-    """The best of `_PREFERRED`; the last one needs nothing and always works."""
-    cuda, llvm, scalar = _PREFERRED
-    if cuda_may_work() and try_variant(cuda, None) is None:
-        return Probe(cuda)
+    """CUDA, LLVM, or the scalar variant, which needs nothing and always works."""
+    if cuda_may_work() and try_variant("cuda_ad_mono", None) is None:
+        return Probe("cuda_ad_mono")
     try:
-        return _probe_llvm(llvm)
+        return _probe_llvm("llvm_ad_mono")
     except RenderError:
-        return Probe(scalar)
+        return Probe("scalar_rgb")
 
 
-@functools.cache
 def _probe_llvm(variant: str) -> Probe:
     """The newest libLLVM with which `variant` renders."""
     reasons = []

@@ -13,9 +13,6 @@ def _fresh_probe(monkeypatch):
     # setenv first, so that what a test stores there is undone even if it was unset before
     monkeypatch.setenv(llvm.PROBE_VARIABLE, "")
     monkeypatch.delenv(llvm.PROBE_VARIABLE)
-    llvm._probe_llvm.cache_clear()
-    yield
-    llvm._probe_llvm.cache_clear()
 
 
 def _children_run(monkeypatch, code):
