@@ -13,6 +13,7 @@ import numpy as np
 from qs3.meshes.mesh import Mesh
 
 Vector = Sequence[float] | np.ndarray
+Profile = Sequence[tuple[float, float]]
 ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -159,25 +160,11 @@ def slab(curve: np.ndarray, height: float, at: Vector = ORIGIN) -> Mesh:
     return shell(curve, [(1, 0.0), (1, height)], at)
 
 
-def shell(curve: np.ndarray, profile: Sequence[tuple[float, float]], at: Vector = ORIGIN) -> Mesh:
+def shell(curve: np.ndarray, profile: Profile, at: Vector = ORIGIN, *, loop: bool = False) -> Mesh:
     """Scaled copies of a plane curve at given heights: profile of (scale, z), closed by caps.
 
-    A profile that goes up outside and down inside makes a vessel.
-    """
-    rings = np.stack([ring_at(curve * scale, z) for scale, z in profile])
-    return loft(rings + np.asarray(at, dtype=np.float64))
-
-
-def lathe(
-    profile: Sequence[tuple[float, float]],
-    at: Vector = ORIGIN,
-    *,
-    sides: int = 20,
-    loop: bool = False,
-) -> Mesh:
-    """A solid of revolution about z: profile of (radius, z).
-
-    Radius 0 at an end makes a pole; `loop` joins the last point to the first (thick shades).
+    A profile that goes up outside and down inside makes a vessel. Scale 0 at an end makes a pole;
+    `loop` joins the last point to the first (thick shades).
     """
     at = np.asarray(at, dtype=np.float64)
     points = list(profile)
@@ -186,9 +173,13 @@ def lathe(
         start = at + np.array([0, 0, points.pop(0)[1]])
     if not loop and points[-1][0] <= 0:
         end = at + np.array([0, 0, points.pop()[1]])
-    circle = ellipse(2, 2, sides)
-    rings = np.stack([ring_at(circle * radius, z) for radius, z in points])
+    rings = np.stack([ring_at(curve * scale, z) for scale, z in points])
     return loft(rings + at, loop=loop, start=start, end=end)
+
+
+def lathe(profile: Profile, at: Vector = ORIGIN, *, sides: int = 20, loop: bool = False) -> Mesh:
+    """A solid of revolution about z: profile of (radius, z), see `shell`."""
+    return shell(ellipse(2, 2, sides), profile, at, loop=loop)
 
 
 def cylinder(
