@@ -19,6 +19,7 @@ _ALONE = 1 << 16  # values that are too few to be shared by threads
 _BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
 
 
+@torch.compiler.disable
 def neighbour_max(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     """Maximum [q, c] over each row's neighbours index [q, k] in x [p, c]; NaN is above all.
 
@@ -30,6 +31,7 @@ def neighbour_max(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     return best, where
 
 
+@torch.compiler.disable
 def neighbour_max_backward(grad: Tensor, where: Tensor, points: int) -> Tensor:
     """The gradient [points, c] of `x`, from that of the maxima [q, c] and their rows."""
     out = grad.new_zeros(points, grad.shape[1])
@@ -37,6 +39,7 @@ def neighbour_max_backward(grad: Tensor, where: Tensor, points: int) -> Tensor:
     return out
 
 
+@torch.compiler.disable
 def add_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
     """A'x: each row of x [q, c] added to the rows that index [q, k] names, [q, c]."""
     out = x.new_zeros(x.shape)
@@ -44,6 +47,7 @@ def add_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
     return out
 
 
+@torch.compiler.disable
 def linear_max_backward(
     x: Tensor, weight: Tensor, grad: Tensor, where: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -57,6 +61,7 @@ def linear_max_backward(
     return dx, dweight
 
 
+@torch.compiler.disable
 def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     """Columns of the k smallest values of each row after `more` was added to them, smallest first.
 
@@ -99,7 +104,6 @@ def groups_for(k: int) -> int:
     return 64 * -(-k // 32)
 
 
-@torch.compiler.disable
 def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:
     """Call a kernel on parts of its range, one for each of torch's threads."""
     from qs3.kernels import numba_kernels
