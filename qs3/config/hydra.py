@@ -151,12 +151,6 @@ def cli_errors(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise CompactHydraException(f"{type(error).__name__}: {error}") from error
 
 
-def is_given(key: str) -> bool:
-    """Whether the command itself sets a key, be it by a sweep, rather than a file of conf/."""
-    words = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
-    return any(word.lstrip("+").partition("=")[0] == key for word in words)
-
-
 def in_multirun() -> bool:
     """Whether this job is one of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

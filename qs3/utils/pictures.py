@@ -29,7 +29,6 @@ DARK = "#18141c"
 PALE = (0.93, 0.94, 0.96)
 """What the colours of a cloud fade to with distance."""
 BLUE, ORANGE, GREEN, RED = "#2f6db3", "#d9822b", "#3a8f5c", "#b5403a"
-PALE_BLUE = "#b9d0ea"
 
 AZIMUTH_DEG, ELEVATION_DEG = -55.0, 18.0
 _BESIDE_DEG = 20.0  # of the camera: straight from there a scan looks whole
