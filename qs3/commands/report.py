@@ -213,8 +213,7 @@ def leaderboard(
         qs3 leaderboard method=my_method.py method.weight=0.5 columns="S -> K"
     """
     from qs3.report.formats import csv_text, save
-    from qs3.report.leaderboard import check_row, first_row, own_row, page
-    from qs3.report.running import launch, missing
+    from qs3.report.running import check_row, first_row, launch, missing, own_row, page
 
     row = own_row(method, name, selftraining, _words(settings, "method."))
     check_row(build(rows=[row], runs=False), row["name"])

@@ -12,8 +12,7 @@ from qs3.config.compose import choices
 from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.report.formats import grid
-from qs3.report.leaderboard import ALONE, WITH_ROUNDS, first_row, own_row
-from qs3.report.running import missing
+from qs3.report.running import ALONE, WITH_ROUNDS, first_row, missing, own_row
 from qs3.report.table import build_table
 from qs3.training.command import train
 from tests.composing import compose
