@@ -104,9 +104,7 @@ def read_arrays(
 def check_shape(where: Any, shape: tuple[int, ...]) -> None:
     """Raise DataError for an array whose rows cannot be points: transposed, or a depth image.
 
-    Args:
-        where: for the message: its file.
-        shape: [n, >= 3], a point a row with perhaps more columns; or [m, n, >= 3], m clouds.
+    Points are [n, >= 3], one a row with perhaps more columns, or [m, n, >= 3], m clouds.
     """
     rows, columns = shape[-2:] if len(shape) in (2, 3) else (0, 0)
     if not 3 <= columns <= _MOST_COLUMNS or (rows == 3 and columns > _FEW):

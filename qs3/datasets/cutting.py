@@ -185,15 +185,8 @@ def cut(
 ) -> Piece:
     """Cut the object of a mask, of which some pixels may be wrong, and judge it.
 
-    Args:
-        image: one depth image.
-        mask: the object's pixels.
-        cls: its class, for the limits.
-        rules: see there.
-        edge_px: of the mask that are taken off; None: `rules.erode_px`.
-
-    Returns:
-        The object; or one that is `refused`, with the reason.
+    Its class `cls` chooses the limits. So many pixels `edge_px` of the mask's edge are taken off;
+    None: `rules.erode_px`.
     """
     piece = cut_out(image, mask, rules, edge_px)
     return replace(piece, faults=tuple(faults(piece, cls, rules)))
@@ -206,7 +199,7 @@ def cut_out(
 
     The mask loses its edge, where labels and depth do not agree to the pixel. What is measured of
     the rest is split where the depth jumps, and the largest piece stays with those that are near
-    it in space. Arguments are those of `cut`.
+    it in space.
     """
     mask = mask & image.inside
     own, measured, core = own_pixels(image, mask, rules, edge_px)

@@ -6,7 +6,6 @@ sources.yaml, which explains its keys.
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import shutil
@@ -23,8 +22,6 @@ from qs3.errors import DataError, Qs3Error
 from qs3.utils.files import make_folder, reading, sha256_file, write_json
 from qs3.utils.locks import locked
 from qs3.utils.settings import settings
-
-log = logging.getLogger(__name__)
 
 MARK = ".download.json"
 """In a folder that was put in place: where it came from. Importers pass over hidden files."""

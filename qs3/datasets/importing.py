@@ -134,10 +134,8 @@ class Importer(abc.ABC):
     ) -> tuple[list[np.ndarray], list[ManifestRow]]:
         """Read everything: [P, 3] float32 clouds with z up, and their rows and those skipped.
 
-        Args:
-            classes: the names in label order.
-            work: a folder for what an importer that takes minutes has done, to continue after an
-                interruption; it is deleted when the store is finished.
+        In the folder `work` an importer that takes minutes may keep what it has done, to go on
+        after an interruption; it is deleted when the store is finished.
         """
         clouds, rows = [], []
         for row, load in shown(self.items(classes), f"importing {self.root.name}"):

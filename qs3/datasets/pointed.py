@@ -204,11 +204,8 @@ def in_box(
     What the object stands on is the plane, within 20° of level, that most points next to and below
     the box lie on; its points and those beneath go. What is left, in the box and around it, is
     parted where the depth jumps: of the pieces that lie within the box the one that is largest and
-    fills it best is the object, with those near it.
-
-    Args:
-        image: with z up.
-        sides: rows from, to and columns from, to.
+    fills it best is the object, with those near it. `image` has z up; `sides` are rows from, to
+    and columns from, to.
     """
     top, bottom, left, right = sides
     height, width = image.depth_m.shape

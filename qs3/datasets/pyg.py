@@ -1,14 +1,10 @@
-r"""Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
+"""Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
 
     from qs3.datasets.pyg import from_pyg, knn_graph, to_pyg
 
     train = to_pyg("specklenet10", "train", transform=FixedPoints(1024))  # a domain of conf/domain
     loader = DataLoader(train, batch_size=32, shuffle=True)               # PyG's own
     from_pyg({"train": mine, "test": my_test}, "data/mine", classes=["box", "cup"])
-
-    python train.py num_classes=2 domain@data.source=own data.source.path=data/mine \
-        data.source.classes=[box,cup] domain@data.target=own data.target.path=data/theirs \
-        data.target.classes=[box,cup]
 
 PyG is imported here and nowhere else in qs3.datasets: import this module when you want it. Its own
 neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges from ours.
@@ -36,11 +32,7 @@ from qs3.store.store import PointSet, write_pointset
 class Clouds(InMemoryDataset):
     """Clouds as PyG has them: `Data(pos=[P, 3] float32, y=[1] int64, id=str)`, in our order.
 
-    Without labels there is no `y`. Pickles, slices, and takes a `transform` like any of PyG's.
-
-    Attributes:
-        classes: names; `y` is a position in this tuple.
-        name: of the dataset.
+    Without labels there is no `y`, else a position in the tuple of names `classes`.
     """
 
     def __init__(self, clouds: PointSet, transform: Callable[[Data], Data] | None = None) -> None:
@@ -66,10 +58,8 @@ def to_pyg(
 ) -> Clouds:
     """A dataset of ours, in memory, for PyG's loaders, transforms and nets.
 
-    Args:
-        source: an open dataset, a domain, or the name of a domain in conf/domain.
-        split: None: all clouds.
-        transform: applied whenever a cloud is taken.
+    `source` is an open dataset, a domain, or the name of a domain in conf/domain; without a split
+    all its clouds. The transform is applied whenever a cloud is taken.
     """
     if isinstance(source, str):
         source = compose_domain(source, {})

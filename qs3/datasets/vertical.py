@@ -64,10 +64,9 @@ def planes_up_steep(
     """As `planes_up`, also for a camera that looks steeply down, and whether it is sure.
 
     Where a camera looks down by more than 45°, the wall before it is nearer to level in the picture
-    than the floor, but then it hangs above the camera like a ceiling: a fit whose level surfaces
-    do so is made again from steeply down on. It is sure if level surfaces below the camera are
-    seen, and were found from up in the picture. A table seen from straight above looks like a wall
-    from the front: that is never sure.
+    than the floor, but hangs above the camera like a ceiling: such a fit is made again from steeply
+    down on. It is sure if level surfaces below the camera are seen, and were found from up in the
+    picture. A table seen from straight above looks like a wall from the front: never sure.
     """
     normals = _normals(_without_lone_holes(depth_m), camera)
     level = _fitted(normals, CAMERA_UP)
