@@ -127,13 +127,12 @@ class SlurmArrays:
             return []
         folder = Path(self.folder).absolute()
         folder.mkdir(parents=True, exist_ok=True)
+        jobs = []
         with executor.batch():
-            jobs = []
             for chunk in chunks:
                 journal = folder / f"journal-{os.urandom(8).hex()}"
-                jobs.append(
-                    _Job(executor.submit(_do_chunk, make_worker, chunk, journal), chunk, journal)
-                )
+                handle = executor.submit(_do_chunk, make_worker, chunk, journal)
+                jobs.append(_Job(handle, chunk, journal))
         return jobs
 
 
@@ -154,11 +153,9 @@ class _Job:
         return sorted(self.journal.parent.glob(f"{self.journal.name}.*"))
 
     def ended(self, limit_s: float) -> bool:
-        """Whether nothing more will come.
+        """Whether nothing more will come, at the latest `limit_s` after its first record.
 
-        Args:
-            limit_s: from its first record on. Then it is ended, too, if SLURM does not say so:
-                where no accounting is kept, a killed job runs for ever.
+        SLURM may not say so: where no accounting is kept, a killed job runs for ever.
         """
         if self.handle.done():
             return True

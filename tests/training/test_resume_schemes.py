@@ -91,7 +91,8 @@ def test_a_plateau_goes_on(toy, tmp_path):
     """In its warm-up; each round begins anew."""
     words = ("protocol=simpleview", "protocol.epochs=40", "protocol.optimizer.lr=4.0")
     check(toy, tmp_path, words, 20)
-    rows = (tmp_path / "whole").glob("*/*/history.csv").__next__().read_text().splitlines()
+    (file,) = (tmp_path / "whole").glob("quickstart/*/history.csv")
+    rows = file.read_text().splitlines()
     rates = [float(row.split(",")[2]) for row in rows[1:]]
     assert rates[0] == 4.0 > rates[39]
     assert rates[40:] == [4.0] * 6
