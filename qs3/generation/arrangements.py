@@ -40,30 +40,24 @@ class Arrangement:
         seats: by class the most chairs that stand at an object and partly under it, each facing it
             at a place of its own; the number is uniform. Only at what has room for them: higher
             than their seats.
-        min_top_m, max_top_m: height of the table's top.
-        min_side_m, max_side_m: of the table.
-        board_m: thickness of its board and of what hangs under it.
-        leg_m: side of its legs.
         apart_m: the table is drawn back by up to so much from what it could cover; half of the
             tables are not.
         things: by class the most things that stand on an object, 0 of a class that is not here;
             the number is uniform. Those of "table" are also for the table it stands at, and those
             of "support" for the furniture that an object above the floor stands on.
-        min_thing_m, max_thing_m: sides of a thing, and its height.
-        min_albedo, max_albedo: of each, as of the room's.
     """
 
     tables: Mapping[str, Share] = field(default_factory=dict)
     seats: Mapping[str, Annotated[int, Ge(0)]] = field(default_factory=dict)
-    min_top_m: Positive = 0.7
+    min_top_m: Positive = 0.7  # height of the table
     max_top_m: Positive = 0.78
-    min_side_m: Positive = 0.7
+    min_side_m: Positive = 0.7  # of the table
     max_side_m: Positive = 1.6
-    board_m: Positive = 0.06
-    leg_m: Positive = 0.05
+    board_m: Positive = 0.06  # thickness of it and of what hangs under it
+    leg_m: Positive = 0.05  # side
     apart_m: NotNegative = 0.3
     things: Mapping[str, Annotated[int, Ge(0)]] = field(default_factory=dict)
-    min_thing_m: Positive = 0.06
+    min_thing_m: Positive = 0.06  # sides and height
     max_thing_m: Positive = 0.4
     min_albedo: Share = 0.25
     max_albedo: Share = 0.9
@@ -73,11 +67,7 @@ class Arrangement:
     ) -> list[Mesh]:
         """The table, if there is one, and all things.
 
-        Args:
-            mesh: the object, placed over the floor z = 0.
-            cls: its class.
-            rng: of the picture.
-            support: what it stands on; None: the floor.
+        Of an object of a class that is placed over the floor z = 0, on it or on a `support`.
         """
         found, most = [], self.things.get
         if rng.random() < self.tables.get(cls, 0.0) and support is None:

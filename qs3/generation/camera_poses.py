@@ -75,24 +75,16 @@ class AnchoredViews:
 
 @settings
 class HandheldViews:
-    """Someone walks along an arc around the object and holds the camera towards it.
-
-    Attributes:
-        count: frames.
-        min_distance_m, max_distance_m: from the circle around the object's footprint, so
-            that the camera does not stand in a bed.
-        min_arc_deg, max_arc_deg: the frames spread over an arc drawn from this range.
-        aim_m: standard deviation of the point aimed at.
-    """
+    """Someone walks along an arc around the object and holds the camera towards it."""
 
     count: Count = 4
-    min_distance_m: Positive = 0.9
+    min_distance_m: Positive = 0.9  # from the circle around the footprint: not in a bed
     max_distance_m: Positive = 2.2
     min_elevation_deg: float = 15.0
     max_elevation_deg: float = 45.0
-    min_arc_deg: float = 30.0
+    min_arc_deg: float = 30.0  # over which the frames are spread
     max_arc_deg: float = 150.0
-    aim_m: NotNegative = 0.08
+    aim_m: NotNegative = 0.08  # standard deviation of the point aimed at
 
     def poses(
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
@@ -114,15 +106,10 @@ class HandheldViews:
 
 @settings
 class Drift:
-    """Error of the tracked camera: a random walk from frame to frame, frame 0 exact.
+    """Error of the tracked camera: a random walk from frame to frame, frame 0 exact."""
 
-    Attributes:
-        shift_m: standard deviation of each step along each axis.
-        turn_rad: standard deviation of each step about each axis.
-    """
-
-    shift_m: NotNegative = 0.0
-    turn_rad: NotNegative = 0.0
+    shift_m: NotNegative = 0.0  # standard deviation of each step along each axis
+    turn_rad: NotNegative = 0.0  # and about each axis
 
     def believed(self, poses: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
         """The poses that fusion uses instead of the true ones."""

@@ -27,16 +27,10 @@ Rough = Annotated[float, Interval(ge=0.1, le=1)]
 
 @settings
 class Kind:
-    """One kind of material; each range is [lowest, highest], drawn evenly.
+    """One kind of material, see `Gloss`; each range is [lowest, highest], drawn evenly."""
 
-    Attributes:
-        weight: how often it is drawn, relative to the others.
-        albedo: in the near infrared, where most dyes are clear and carbon black is not.
-        roughness, specular, metal: see `Gloss`.
-    """
-
-    weight: NotNegative
-    albedo: tuple[Share, Share]
+    weight: NotNegative  # how often it is drawn, relative to the others
+    albedo: tuple[Share, Share]  # in the near infrared: most dyes are clear, carbon black is not
     roughness: tuple[Rough, Rough]
     specular: tuple[Share, Share] = (0.5, 0.5)
     metal: bool = False
@@ -55,14 +49,10 @@ class MixedMaterials:
 
     A part is what hangs together by its vertices; parts that are alike, as a chair's legs are,
     have the same material. What is drawn depends on the generator and the mesh alone.
-
-    Attributes:
-        max_materials: of an object; the number is uniform.
-        kinds: by name.
     """
 
     kinds: Mapping[str, Kind]
-    max_materials: Count = 3
+    max_materials: Count = 3  # of an object; the number is uniform
 
     def dress(self, bodies: Sequence[Body], rng: np.random.Generator) -> tuple[Body, ...]:
         """The same shapes with materials; the first body, the object, as one body a material."""
@@ -130,18 +120,14 @@ def _faces_of(mesh: Mesh, wanted: np.ndarray) -> Mesh:
 class LightAbove:
     """The paper's light (section 3.1): one area light on top of the object, a level square.
 
-    Attributes:
-        height_m: over the object's highest point.
-        side_m: of the square, whose middle is over the object's.
-        strength: radiance of a white level surface there, in the units of `sensor.ambient`: with
-            sensor=speckle_stereo a lit dot on white has 1 at 4 m.
-        ambient: of light from all sides, in place of `sensor.ambient`; null: that.
+    Its strength is the radiance of a white level surface there, in the units of `sensor.ambient`:
+    with sensor=speckle_stereo a lit dot on white has 1 at 4 m.
     """
 
-    height_m: Positive = 1.5
-    side_m: Positive = 24.34
+    height_m: Positive = 1.5  # over the object's highest point
+    side_m: Positive = 24.34  # of the square, whose middle is over the object's
     strength: NotNegative = 0.15
-    ambient: NotNegative | None = None
+    ambient: NotNegative | None = None  # of light from all sides; null: `sensor.ambient`
 
     def over(self, box_m: np.ndarray) -> Lighting:
         """Over an object with box [2, 3]."""

@@ -41,18 +41,14 @@ Least = Annotated[int, Ge(0)]
 class Cloud:
     """What a recipe makes of one mesh.
 
-    Attributes:
-        arrays: [P, 3] float32 by name; "points", and "points_clean" where there is a twin;
-            where it was asked for also "provenance" [P, 5] of "points".
-        views: frames that gave points.
-        valid_points: points before sampling.
-        frames: the depth frames, for looking at (empty where there are none).
+    `arrays` are [P, 3] float32 by name: "points", and "points_clean" where there is a twin; where
+    it was asked for also "provenance" [P, 5] of "points".
     """
 
     arrays: Mapping[str, np.ndarray]
-    views: int
-    valid_points: int
-    frames: tuple[DepthFrame, ...] = ()
+    views: int  # that gave points
+    valid_points: int  # before sampling
+    frames: tuple[DepthFrame, ...] = ()  # for looking at
 
 
 class Recipe(Protocol):
@@ -99,18 +95,12 @@ class MaskCrop(BoxCrop):
     The mask of what is really seen grows or shrinks by a few pixels and is shifted; of the
     background that comes in, the box keeps what is near the object. Pixels are those of the depth
     image: with `step_px=4` one is four of the camera's.
-
-    Attributes:
-        min_grow_px, max_grow_px: the mask's outline moves outwards by a whole number of
-            pixels drawn from this range.
-        max_shift_px: and the mask moves by up to so many pixels along each axis.
-        margin_m: by which the object's axis-aligned box is enlarged.
     """
 
-    margin_m: NotNegative = 0.1
-    min_grow_px: int = -1
+    margin_m: NotNegative = 0.1  # by which the object's axis-aligned box is enlarged
+    min_grow_px: int = -1  # by which the mask's outline moves outwards, a whole number
     max_grow_px: int = 3
-    max_shift_px: Least = 2
+    max_shift_px: Least = 2  # of the mask along each axis
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray:
         """[h, w] bool."""

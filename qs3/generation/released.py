@@ -47,16 +47,12 @@ _ARRAYS = {
 class PoseTable:
     """The poses of many shapes: plain arrays, so that sending them to a worker is cheap.
 
-    Attributes:
-        ids: sorted, "class/split/name" with our names of classes.
-        objects: [N, 5] float64: scale, yaw (rad), location (m).
-        cameras: [N, V, 6] float64: location (m) and Euler angles (rad) as Blender has them: XYZ
-            order, looking along -z with y up.
+    Angles of cameras are Euler's as Blender has them: XYZ order, looking along -z with y up.
     """
 
-    ids: tuple[str, ...]
-    objects: np.ndarray
-    cameras: np.ndarray
+    ids: tuple[str, ...]  # sorted, "class/split/name" with our names of classes
+    objects: np.ndarray  # [N, 5] float64: scale, yaw (rad), location (m)
+    cameras: np.ndarray  # [N, V, 6] float64: location (m) and angles (rad)
 
     @property
     def views(self) -> int:
@@ -163,9 +159,6 @@ class ReleasedPlacing:
     The released scale is 1 over the largest side of the authors' mesh, and its location brings
     the middle of its box to the origin. A mesh for which that does not hold is not theirs, or is
     in other units or has another axis up; it is refused, as its views would miss it.
-
-    Attributes:
-        table: of all shapes.
     """
 
     table: PoseTable
@@ -188,15 +181,10 @@ class ReleasedPlacing:
 
 @dataclass(frozen=True, eq=False)
 class ReleasedViews:
-    """The cameras of the released poses.
-
-    Attributes:
-        table: of all shapes.
-        count: the first so many of each; at most `table.views`.
-    """
+    """The cameras of the released poses."""
 
     table: PoseTable
-    count: int = 5
+    count: int = 5  # the first so many of each
 
     def __post_init__(self) -> None:
         if self.count > self.table.views:

@@ -42,28 +42,18 @@ _WORKTOP_M = 0.05
 
 @settings
 class RoomCamera:
-    """Somebody stands in a room; the object is anywhere in the picture.
+    """Somebody stands in a room; the object is anywhere in the picture."""
 
-    Attributes:
-        min_height_m, max_height_m: of the camera above the floor.
-        min_distance_m, max_distance_m: along the floor, from the object's middle.
-        clearance_m: at least so far from the circle around the object's footprint.
-        spread: the object's middle lies within this share of the picture's half width and height.
-        min_pitch_deg, max_pitch_deg: how far the camera looks down.
-        roll_deg: standard deviation.
-        side_deg: how far from straight before it a camera stands that sees an object's front.
-    """
-
-    min_height_m: float = 1.1
+    min_height_m: float = 1.1  # above the floor
     max_height_m: float = 1.7
-    min_distance_m: Positive = 1.3
+    min_distance_m: Positive = 1.3  # along the floor, from the object's middle
     max_distance_m: Positive = 4.5
-    clearance_m: NotNegative = 0.6
-    spread: Share = 0.85
-    min_pitch_deg: float = -5.0
+    clearance_m: NotNegative = 0.6  # at least, from the circle around the object's footprint
+    spread: Share = 0.85  # of the picture's half width and height, within which its middle lies
+    min_pitch_deg: float = -5.0  # how far the camera looks down
     max_pitch_deg: float = 40.0
-    roll_deg: NotNegative = 1.5
-    side_deg: Annotated[float, Interval(ge=0, le=180)] = 75.0
+    roll_deg: NotNegative = 1.5  # standard deviation
+    side_deg: Annotated[float, Interval(ge=0, le=180)] = 75.0  # from straight before a front
 
     def pose(
         self,

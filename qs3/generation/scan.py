@@ -31,9 +31,8 @@ class Scan:
         id: of the object; its bytes depend on it and on the seed.
         points: [P, 3] float32, metres, z up: fused and sampled, as training gets it.
         clean: [P, 3] float32, the twin from the true depth; None where the domain has none.
-        views: frames that gave points; 0 where the domain looks at nothing.
+        views: frames that gave points; 0, and no `frames`, where the domain looks at nothing.
         valid_points: measured points before sampling to P.
-        frames: the depth frames of all views; empty where the domain looks at nothing.
         provenance: with provenance=true [P, 5], see `qs3.generation.kept`; else None.
         colliders: invisible nodes of a scene that were left out; 0 with colliders=keep.
     """

@@ -52,21 +52,12 @@ class Alone:
 
 @settings
 class Support:
-    """What an object above the floor stands on: a block, or a board on four legs.
+    """What an object above the floor stands on: a block, or a board on four legs."""
 
-    Attributes:
-        min_margin_m, max_margin_m: the top is wider than the object by so much, drawn for each of
-            its four sides, so that the object stands anywhere on it.
-        block: probability of a block down to the floor (a chest, a cabinet); else it is a board on
-            legs (a table, a desk).
-        min_board_m, max_board_m: thickness of the board.
-        min_leg_m, max_leg_m: of the legs.
-    """
-
-    min_margin_m: Positive = 0.03
+    min_margin_m: Positive = 0.03  # by which the top is wider, drawn for each of its four sides
     max_margin_m: Positive = 0.4
-    block: Share = 0.4
-    min_board_m: Positive = 0.02
+    block: Share = 0.4  # probability of a block down to the floor, as a chest is
+    min_board_m: Positive = 0.02  # thickness
     max_board_m: Positive = 0.06
     min_leg_m: Positive = 0.03
     max_leg_m: Positive = 0.08
@@ -91,28 +82,19 @@ class Support:
 class Room:
     """The object stands on a floor, maybe before a wall, among boxes and cylinders.
 
-    Attributes:
-        wall: probability of a wall behind the object.
-        max_clutter: up to so many pieces stand around the object ...
-        max_occluders: ... and so many close to it, where they hide a part of it.
-        clutter_m, occluder_m: the largest side of either along the floor; pieces are up to 1.6
-            times as high.
-        max_between: up to so many pieces stand between the first camera and the object, some way
-            before it, as a table stands before a chair; as large as `between_m` along the floor
-            and as high as `between_height_m`.
-        min_albedo, max_albedo: of every body, drawn for each.
-        support: what an object stands on that is above the floor.
+    Pieces between the first camera and the object stand some way before it, as a table before a
+    chair.
     """
 
-    wall: Share = 0.5
-    max_clutter: Annotated[int, Ge(0)] = 5
-    max_occluders: Annotated[int, Ge(0)] = 2
-    clutter_m: Positive = 0.5
-    occluder_m: Positive = 0.3
-    max_between: Annotated[int, Ge(0)] = 0
-    between_m: Positive = 1.0
+    wall: Share = 0.5  # probability of one behind the object
+    max_clutter: Annotated[int, Ge(0)] = 5  # pieces around the object
+    max_occluders: Annotated[int, Ge(0)] = 2  # pieces close to it, which hide a part of it
+    clutter_m: Positive = 0.5  # largest side along the floor; up to 1.6 times as high
+    occluder_m: Positive = 0.3  # likewise
+    max_between: Annotated[int, Ge(0)] = 0  # pieces between it and the first camera
+    between_m: Positive = 1.0  # largest side along the floor
     between_height_m: Positive = 0.8
-    min_albedo: Share = 0.25
+    min_albedo: Share = 0.25  # of every body, drawn for each
     max_albedo: Share = 0.9
     support: InstanceOf[Support] = field(default_factory=Support)
 

@@ -43,50 +43,35 @@ _LIBRARIES = ("numpy", "opencv-python-headless", "fpsample", "mitsuba", "drjit",
 class Outcome:
     """What became of one object.
 
-    Attributes:
-        item_id: of the mesh item.
-        mesh_sha256: of the mesh as loaded; empty if it could not be.
-        cloud: None if it failed; without its frames.
-        reason: why it failed; empty if it did not.
-        lasting: whether it would fail again: the object is to blame, and not the machine or a
-            defect of ours. Other failures are tried again at the next start.
-        unavailable: its mesh is there no more: the dataset is not finished without it.
-        note: what else its manifest row should state of an object that did not fail.
-        saved: the worker has saved it (`Job.save`); then `cloud` is None here.
+    A failure is lasting if the object is to blame, and not the machine or a defect of ours; others
+    are tried again at the next start.
     """
 
     item_id: str
-    mesh_sha256: str
-    cloud: Cloud | None
-    reason: str
+    mesh_sha256: str  # of the mesh as loaded; empty if it could not be
+    cloud: Cloud | None  # None if it failed; without its frames
+    reason: str  # why it failed; empty if it did not
     lasting: bool = True
-    unavailable: bool = False
-    note: str = ""
-    saved: bool = False
+    unavailable: bool = False  # its mesh is there no more: the dataset is not finished without it
+    note: str = ""  # what else its manifest row should state of an object that did not fail
+    saved: bool = False  # by the worker (`Job.save`); then `cloud` is None here
 
 
 @dataclass(frozen=True)
 class Job:
-    """What every worker needs to know once.
+    """What every worker needs to know once; picklable.
 
-    Attributes:
-        recipe: how a cloud is made.
-        make_renderer: picklable; called once in each worker if the recipe needs one.
-        seed: of the dataset.
-        keep: what is wanted besides the clouds.
-        save: picklable; a worker process saves lasting outcomes by it, so that what is done is
-            on disk whatever happens to the others.
-        expected: for workers on other machines: libraries, code and renderer of this one.
-        check_place: likewise; raises where `save` would not save for us.
+    A worker process saves lasting outcomes itself, so that what is done is on disk whatever happens
+    to the others.
     """
 
     recipe: Recipe
-    make_renderer: Callable[[], Renderer]
-    seed: int
+    make_renderer: Callable[[], Renderer]  # called once in each worker if the recipe needs one
+    seed: int  # of the dataset
     keep: Keep = field(default_factory=Keep)
     save: Callable[[Outcome], None] | None = None
-    expected: Mapping[str, str] | None = None
-    check_place: Callable[[], None] | None = None
+    expected: Mapping[str, str] | None = None  # of workers elsewhere: libraries, code, renderer
+    check_place: Callable[[], None] | None = None  # likewise; raises where `save` would be lost
 
 
 def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
