@@ -99,6 +99,11 @@ class PointClassifier(nn.Module):
         self.backbone.compile(*args, **settings)
 
 
+def with_head(backbone: Backbone, num_classes: int, **settings: Any) -> PointClassifier:
+    """A backbone and a `ClassHead` with these settings."""
+    return PointClassifier(backbone, ClassHead(backbone.feature_dim, num_classes, **settings))
+
+
 def check_points(points: Tensor) -> None:
     """Raise `DataError` unless `points` is a finite, not empty [B, N, 3].
 

@@ -27,7 +27,7 @@ from qs3.kernels.linear_max import pooled_linear
 from qs3.kernels.matmul import linear
 from qs3.kernels.norms import Norm, head_norm, make_norm, normed, uses_batch
 from qs3.kernels.pointwise_max import max_over_members, max_over_rows
-from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.base import Backbone, Features, PointClassifier, with_head
 from qs3.utils.settings import checked
 
 Variant = Literal["uda", "simpleview", "defrec"]
@@ -173,11 +173,5 @@ def dgcnn(
 ) -> PointClassifier:
     """DGCNN with its class head (512, 256; batch norm, LeakyReLU 0.2)."""
     backbone = DGCNN(k=k, variant=variant, norm=norm)
-    head = ClassHead(
-        backbone.feature_dim,
-        num_classes,
-        dropout=dropout,
-        first_bias=variant != "simpleview",
-        norm=norm,
-    )
-    return PointClassifier(backbone, head)
+    first_bias = variant != "simpleview"
+    return with_head(backbone, num_classes, dropout=dropout, first_bias=first_bias, norm=norm)

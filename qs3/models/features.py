@@ -25,7 +25,7 @@ from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import keep_array, read_array
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.kernels.device import exporting
-from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.base import Backbone, Features, PointClassifier, with_head
 from qs3.utils.settings import checked
 
 log = logging.getLogger(__name__)
@@ -147,9 +147,8 @@ def features(
         MissingDataError: the file is not there.
         DataError: it is another one than that of this hash, damaged, or not such a net.
     """
-    encoder = _encoder(file, sha256)
-    head = ClassHead(encoder.dim, num_classes, hidden=tuple(hidden), dropout=dropout, norm=norm)
-    return PointClassifier(Frozen(encoder), head)
+    backbone = Frozen(_encoder(file, sha256))
+    return with_head(backbone, num_classes, hidden=tuple(hidden), dropout=dropout, norm=norm)
 
 
 def remember(net: nn.Module, of: Iterable[Clouds], folder: Path | None) -> None:

@@ -43,7 +43,6 @@ class NodeModule(nn.Module):
         nodes: M.
         neighbours: K; also the size of a ball.
         radius: of the balls, in the unit of the points.
-        norm: see `qs3.kernels.norms`.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ from qs3 import kernels as fast
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import Norm, head_norm, make_norm, normed
 from qs3.kernels.pointwise_max import normed_maximum
-from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.base import Backbone, Features, PointClassifier, with_head
 from qs3.utils.settings import checked
 
 Variant = Literal["simpleview", "uda", "basic"]
@@ -76,7 +76,6 @@ class TNet(nn.Module):
 
     Args:
         channels: C.
-        norm: see `qs3.kernels.norms`.
         activation: after the maximum; PointDAN has LeakyReLU 0.01 there, the others ReLU.
     """
 
@@ -101,12 +100,7 @@ class TNet(nn.Module):
 
 
 class PointNet(Backbone):
-    """Shared maps of each point, and the maximum over the points.
-
-    Args:
-        variant: "simpleview", "uda" or "basic", see the module.
-        norm: see `qs3.kernels.norms`.
-    """
+    """Shared maps of each point, and the maximum over the points; see the module for variants."""
 
     feature_dim = 1024
 
@@ -180,15 +174,12 @@ def pointnet(
             nn.Linear(256, num_classes),
         )
         return PointClassifier(backbone, head)
-    return PointClassifier(
+    return with_head(
         backbone,
-        ClassHead(
-            backbone.feature_dim,
-            num_classes,
-            hidden=(512,) if variant == "basic" else (512, 256),
-            dropout=dropout,
-            negative_slope=0.0,
-            first_bias=False,
-            norm=norm,
-        ),
+        num_classes,
+        hidden=(512,) if variant == "basic" else (512, 256),
+        dropout=dropout,
+        negative_slope=0.0,
+        first_bias=False,
+        norm=norm,
     )

@@ -22,7 +22,7 @@ from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.kernels.grouped_mlp_max import grouped_mlp_max
 from qs3.kernels.norms import Norm, make_norm, normed
 from qs3.kernels.pointwise_max import max_over_members
-from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.base import Backbone, Features, PointClassifier, with_head
 from qs3.utils.settings import checked
 
 
@@ -93,7 +93,6 @@ class SetAbstraction(nn.Module):
         channels: C of the points' features, 0 for none.
         centres: M.
         scales: their features are put side by side.
-        norm: see `GroupedMLP`.
     """
 
     def __init__(self, channels: int, centres: int, scales: Sequence[Scale], norm: Norm) -> None:
@@ -116,12 +115,7 @@ class SetAbstraction(nn.Module):
 
 
 class PointNet2(Backbone):
-    """Two set abstractions, then one group of all: 256, 512, 1024 and the maximum.
-
-    Args:
-        variant: "msg" or "ssg".
-        norm: see `qs3.kernels.norms`.
-    """
+    """Two set abstractions, then one group of all: 256, 512, 1024 and the maximum."""
 
     feature_dim = 1024
     least_points = 513  # more than there are centres: fewer start over
@@ -158,12 +152,6 @@ def pointnet2(
 ) -> PointClassifier:
     """PointNet++ with its class head (512, 256; ReLU)."""
     backbone = PointNet2(variant=variant, norm=norm)
-    head = ClassHead(
-        backbone.feature_dim,
-        num_classes,
-        dropout=dropout,
-        negative_slope=0.0,
-        hidden_bias=False,
-        norm=norm,
+    return with_head(
+        backbone, num_classes, dropout=dropout, negative_slope=0.0, hidden_bias=False, norm=norm
     )
-    return PointClassifier(backbone, head)

@@ -23,7 +23,7 @@ from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.kernels.norms import Norm, make_norm, normed
 from qs3.kernels.pointwise_max import max_over_members
 from qs3.kernels.rsconv import relations, rs_conv
-from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.base import Backbone, Features, PointClassifier, with_head
 from qs3.utils.settings import checked
 
 Relation = Literal["released", "paper"]
@@ -41,8 +41,6 @@ class RSConv(nn.Module):
         channels: of the points' features; 0 at the first layer, which raises d to 16 channels.
         hidden: channels between the two layers of M.
         out_channels: of the result.
-        relation: see the module.
-        norm: see `qs3.kernels.norms`.
     """
 
     def __init__(
@@ -126,10 +124,6 @@ class RSCNN(Backbone):
     Farthest point sampling starts at point 0. The order of the points matters through that, through
     balls with more points than slots, and through `relation="released"`. No gradient reaches the
     points. A point has no features of its own.
-
-    Args:
-        relation: "released" or "paper", see the module.
-        norm: see `qs3.kernels.norms`; statistics are of all slots of all balls.
     """
 
     feature_dim = 1024
@@ -178,12 +172,6 @@ def rscnn(
 ) -> PointClassifier:
     """RS-CNN with its class head (512, 256; ReLU)."""
     backbone = RSCNN(relation=relation, norm=norm)
-    head = ClassHead(
-        backbone.feature_dim,
-        num_classes,
-        dropout=dropout,
-        negative_slope=0.0,
-        hidden_bias=False,
-        norm=norm,
+    return with_head(
+        backbone, num_classes, dropout=dropout, negative_slope=0.0, hidden_bias=False, norm=norm
     )
-    return PointClassifier(backbone, head)

@@ -155,9 +155,7 @@ class ResNet18(nn.Module):
     Kaiming-normal weights (fan out) except at the stem, which has torch's default; the last norm
     of each block starts with weight 0. Maps are kept in channels-last layout.
 
-    Args:
-        channels: at the stem.
-        norm: see `qs3.kernels.norms`; "instance" is over each image.
+    `channels` are those at the stem; an "instance" norm is over each image.
     """
 
     def __init__(self, channels: int = 16, norm: Norm = "batch") -> None:
