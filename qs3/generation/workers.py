@@ -108,7 +108,7 @@ def save_part(parts: PartFiles, outcome: Outcome) -> None:
 
 def load_part(parts: PartFiles, item_id: str) -> Outcome:
     """One outcome; its arrays stay on disk until they are asked for."""
-    note, arrays = parts.open(_name(item_id))
+    note, arrays = parts.read(_name(item_id))
     views, points = note.pop("views"), note.pop("valid_points")
     cloud = Cloud(arrays, views, points) if arrays else None
     return Outcome(cloud=cloud, **note)

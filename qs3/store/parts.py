@@ -94,13 +94,11 @@ class PartFiles:
         np.savez(file, note=text, **arrays)
         write_bytes(self._path(name), file.getvalue())
 
-    def read(self, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The note and the arrays of one part; DataError if it is damaged or not there."""
-        note, arrays = self.open(name)
-        return note, dict(arrays)
+    def read(self, name: str) -> tuple[dict[str, Any], ArraysOnDisk]:
+        """The note and the arrays of one part; DataError if it is damaged or not there.
 
-    def open(self, name: str) -> tuple[dict[str, Any], ArraysOnDisk]:
-        """The same, but an array is read, each time, when it is asked for; it raises then, too."""
+        An array is read, each time, when it is asked for; it raises then, too.
+        """
         path = self._path(name)
         with _opened(path) as file:
             note = json.loads(file["note"].tobytes())
@@ -124,7 +122,7 @@ class PartFiles:
 
 
 class ArraysOnDisk(Mapping[str, np.ndarray]):
-    """The arrays of one part, by their names; see `PartFiles.open`."""
+    """The arrays of one part, by their names; see `PartFiles.read`."""
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
         self._path, self._names = path, list(names)

@@ -2,7 +2,8 @@ r"""Point clouds on disk: one folder a dataset, written atomically, checked when
 
     points.npy         float32 [N, P, 3], C order, metres or the published unit; read as a memmap
     points_clean.npy   optional further arrays of the same shape (here the clean twin)
-    provenance.npy     optional tables, float32 [N, P, columns]: what is known of each point
+    provenance.npy     optional tables, float32 [N, P, columns]: what is known of each point of
+                       points.npy; meta.yaml names the columns
     manifest.csv       one row an object; those with status "ok" are the N clouds, in order
     meta.yaml          name, classes, hashes, and how it was made; written last
 
@@ -241,7 +242,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         raise DataError(f"{folder} holds the arrays {have}, not {variant!r}: generate it again")
     rows = read_manifest(folder, classes, hashes["manifest"])
     kept = [row for row in rows if row.status == OK]
-    points = _open_array(folder, variant, meta, 3, verify)
+    points = _open_array(folder, variant, meta, verify)
     for start in range(0, len(points), _CHUNK_CLOUDS):
         if (bad := _first_bad(points[start : start + _CHUNK_CLOUDS])) is not None:
             where = f"{folder / variant}.npy, cloud {start + bad} (id {kept[start + bad].id!r})"
@@ -257,19 +258,6 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         sha256=_content_hash(hashes[variant], classes, kept),
         meta=meta,
     )
-
-
-def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray, tuple[str, ...]]:
-    """Open what a dataset knows of each point of its variant "points".
-
-    Returns:
-        [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names
-        of the columns. For "provenance" see `qs3.generation.kept.provenance_of`.
-    """
-    folder = Path(folder)
-    meta = read_meta(folder)
-    columns = tuple(meta["tables"][name])
-    return _open_array(folder, name, meta, len(columns), verify=True), columns
 
 
 def _content_hash(array: str, classes: Sequence[str], rows: Sequence[ManifestRow]) -> str:
@@ -305,11 +293,9 @@ def _write_array(path: Path, clouds: Clouds) -> str:
     return whole.hexdigest()
 
 
-def _open_array(
-    folder: Path, key: str, meta: Mapping[str, Any], columns: int, verify: bool
-) -> np.ndarray:
-    """[N, P, columns] float32 memmap whose header, size and hash are what they were."""
-    path, shape = folder / f"{key}.npy", (meta["clouds"], meta["points"], columns)
+def _open_array(folder: Path, key: str, meta: Mapping[str, Any], verify: bool) -> np.ndarray:
+    """[N, P, 3] float32 memmap whose header, size and hash are what they were."""
+    path, shape = folder / f"{key}.npy", (meta["clouds"], meta["points"], 3)
     head = _header(shape)
     size = len(head) + 4 * shape[0] * shape[1] * shape[2]
     try:

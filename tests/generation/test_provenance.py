@@ -12,7 +12,6 @@ from qs3.generation.kept import (
     PROVENANCE,
 )
 from qs3.sensors.optics.visibility import Reason
-from qs3.store.store import open_table
 from tests.generation.generating import config
 
 KEPT = ["provenance=true", "keep_views=true", "tracking=drifting", "scene=room"]
@@ -51,8 +50,8 @@ def views_of(folder, name):
 
 def test_every_point_is_its_pixel_at_the_measured_depth(kept):
     folder, pointset = kept
-    table, columns = open_table(folder)
-    assert columns == PROVENANCE
+    table = np.load(folder / "provenance.npy")
+    assert pointset.meta["tables"] == {"provenance": list(PROVENANCE)}
     assert table.shape == (*pointset.points.shape[:2], 5)
     for cloud, rows, name in zip(pointset.points, table, pointset.ids, strict=True):
         views = views_of(folder, name)
