@@ -35,12 +35,7 @@ _LEAST_T, _MOST_T, _TINY = 0.05, 20.0, 1e-300
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What a net is on held-out labelled clouds.
-
-    Attributes:
-        accuracy: as (right + 1) / (v + 2) of v clouds: none of v is not certain.
-        temperature: see there.
-    """
+    """What a net is on v held-out labelled clouds: (right + 1) / (v + 2), and `temperature`."""
 
     accuracy: float
     temperature: float
@@ -59,10 +54,7 @@ def held_out(
 def expected_accuracy(
     known: HeldOut | None, probabilities: Float[np.ndarray, "n c"]
 ) -> float | None:
-    """The share of these answers that is expected to be right.
-
-    None of fewer than `FEWEST` clouds, of a net that has diverged, or if nothing is known of it.
-    """
+    """The share of these answers that is expected to be right; None if nothing can be said."""
     if known is None or len(probabilities) < FEWEST or not np.isfinite(probabilities).all():
         return None
     sure = float(scaled(probabilities, known.temperature).max(axis=1).mean())

@@ -45,12 +45,9 @@ _STEPS, _CLOSE = 10_000, 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """How much commoner classes are than in training.
+    """How much commoner classes are than in training: q by class, of sum 1, and t.
 
-    Attributes:
-        shares: q >= 0 by class, of sum 1.
-        power: t.
-        factors: [C] >= 0, one of them above 0: (q_k / u_k)^t, the largest of them 1.
+    `factors` are (q_k / u_k)^t, the largest of them 1.
     """
 
     shares: dict[str, float]

@@ -164,10 +164,11 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 
 
 def view_images(frame: DepthFrame) -> list[tuple[str, Image]]:
-    """Infrared image, disparity, depth and reasons of a view, with their titles."""
+    """Infrared images, disparity, depth and reasons of a view, with their titles."""
     found = []
     for name, values, colours, unit in (
         ("infrared", photograph(frame.images), "gray", ""),
+        ("infrared, right", frame.images.get("right"), "gray", ""),
         ("disparity", frame.images.get("disparity"), "viridis", "px"),
         ("depth", frame.depth_m, "viridis", "m"),
     ):

@@ -28,12 +28,9 @@ ALL = "all"
 class Compared:
     """A difference between cells.
 
-    Attributes:
-        name: of the row, and of the column if there are several.
-        subsets: the differences in accuracy and in balanced accuracy, of all clouds, then of each
-            tier; empty if `why` says what is missing.
-        why: "" or the reason.
-        clusters: what clouds of one cluster share, see `results.MESHES`.
+    `subsets` are the differences in accuracy and in balanced accuracy, of all clouds, then of each
+    tier; empty if `why` says what is missing. `clusters`: what clouds of one cluster share, see
+    `results.MESHES`.
     """
 
     name: str
@@ -43,11 +40,7 @@ class Compared:
 
 
 def row_of(table: Table, word: str) -> str:
-    """The one row that a word means.
-
-    Raises:
-        ConfigError: none or several.
-    """
+    """The one row that a word means; a ConfigError for none or several."""
     meant = chosen(table.rows, [word])
     if len(meant) > 1:
         raise ConfigError(f"base={word} may be {' or '.join(map(repr, meant))}")
@@ -144,9 +137,8 @@ def _difference(name: str, cells: Sequence[Cell], seeds: Sequence[int]) -> Compa
 def text(found: Sequence[Compared], base: str = "", table: Table | None = None) -> str:
     """A line a row: differences in percentage points, and how many seeds would tell them apart.
 
-    Args:
-        found: of `against` (with its `base`) or `effects`.
-        table: that they are of: its title and what must not be overlooked come first.
+    `found` is of `against` (with its `base`) or `effects`; of their `table` the title and what must
+    not be overlooked come first.
     """
     tiers = any(len(one.subsets) > 1 for one in found)
     header = [f"minus {base}" if base else "difference", *["clouds"] * tiers]

@@ -32,12 +32,10 @@ BLOCK = 30
 
 @dataclass(frozen=True)
 class Family:
-    """Runs of one config that saw the same data.
+    """Runs of one config that saw the same data: result files by seed, -1 where it is not known.
 
-    Attributes:
-        name: experiment and hash; or of a classifier that comes with qs3; or the run's path.
-        data: what both domains are made of; "" where not known.
-        runs: result files by seed; -1 where that is not known.
+    `name` is experiment and hash, or the classifier's that comes with qs3, or the run's path;
+    `data` what both domains are made of, "" where that is not known.
     """
 
     name: str

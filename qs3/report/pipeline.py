@@ -23,7 +23,7 @@ from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import Up, load_mesh
 from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.sensors.base import DepthFrame
-from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, value_image
+from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet
 from qs3.utils.seeding import object_rng
 
 if TYPE_CHECKING:
@@ -53,7 +53,6 @@ class ScannedObject:
     Attributes:
         name: its id.
         domain: its label, and what was changed in its settings.
-        sensor: class of the sensor, and its renderer; "" where the domain has none.
         views: by number; none where the domain has no sensor.
         cloud: [P, 3] float32, metres: fused and sampled, as training gets it.
         clean: [P, 3] float32 its clean twin, or None.
@@ -62,7 +61,6 @@ class ScannedObject:
 
     name: str
     domain: str
-    sensor: str
     views: tuple[View, ...]
     cloud: np.ndarray
     clean: np.ndarray | None
@@ -112,7 +110,7 @@ def scan_object(
 
     cfg = composed("generate", *overrides)
     scanner = Scanner(cfg)
-    recipe, renderer = scanner.recipe, str((cfg.get("renderer") or {}).get("name", ""))
+    recipe = scanner.recipe
     if mesh is not None:
         path = Path(mesh).expanduser()
         up: Up = "y" if cfg.up == "y" else "z"
@@ -131,10 +129,9 @@ def scan_object(
     shown = ("domain=", "renderer=", "paths.", "workers=")
     changed = [word for word in overrides if not word.startswith(shown)]
     label = build(cfg.domain).label + (f" with {' '.join(changed)}" if changed else "")
-    sensor = f"{type(recipe.sensor).__name__} rendered by {renderer.capitalize()}" if looks else ""
     placed = recipe.placing.place(loaded, object_rng(cfg.seed, item.id, 0), item.id)
     clouds = made["points"], made.get("points_clean")
-    return ScannedObject(item.id, label, sensor, tuple(views), *clouds, placed)
+    return ScannedObject(item.id, label, tuple(views), *clouds, placed)
 
 
 def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
@@ -143,19 +140,10 @@ def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
     if one.views:
         if view >= len(one.views):
             raise ConfigError(f"view={view}: {one.name} has {len(one.views)} views")
-        frame = one.views[view].frame
-        words += f": {one.sensor}, {len(one.views)} views, images of view {view}"
-        infrared, *others = view_images(frame)
-        if (right := frame.images.get("right")) is not None:
-            others.insert(0, ("infrared, right", value_image(right, *_ends(right), "gray")))
-        pictures = [infrared, *others, *pictures]
+        words += f", view {view} of {len(one.views)}"
+        pictures = [*view_images(one.views[view].frame), *pictures]
     titles, images = zip(*pictures, strict=True)
     return sheet(images, titles, columns=4, heading=words, panel_in=_PANEL_IN)
-
-
-def _ends(values: np.ndarray) -> tuple[float, float]:
-    low, high = np.percentile(values, [2, 98])
-    return float(low), float(high)
 
 
 def cloud_images(one: ScannedObject) -> list[Picture]:

@@ -116,11 +116,7 @@ def read_run(folder: str | Path) -> RunFiles:
 
 
 def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> Domain:
-    """A domain ("source" or "target") as the run's config describes it.
-
-    Raises:
-        MissingDataError: there is no config.
-    """
+    """A domain ("source" or "target") as the run's config describes it."""
     from omegaconf import OmegaConf
 
     import qs3.config.hydra  # noqa: F401 (registers the resolvers of a config)
@@ -288,25 +284,15 @@ def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[st
 
 
 def worst_clouds(
-    run: RunFiles,
-    most: int,
-    match: str = "",
-    data_dir: str | Path | None = None,
+    run: RunFiles, most: int, match: str = "", data_dir: str | Path | None = None
 ) -> Part:
-    """Clouds of the run's target with its predictions, for the viewer.
+    """At most so many clouds of a run's target, whose ids hold `match`, with its predictions.
 
     First the errors, the most confident before the others; then all else, the least confident
-    first.
-
-    Args:
-        run: finished.
-        most: clouds.
-        match: a part of their ids.
-        data_dir: where the datasets lie; None: where the run's config says.
+    first. `data_dir`: where the datasets lie; None: where the run's config says.
 
     Raises:
         MissingDataError: the run's target is not there, or there are no predictions.
-        DataError: it is damaged.
     """
     p, m = run.predictions, run.metrics
     if p is None or m is None:
@@ -358,13 +344,9 @@ class AfterTraining:
             _log_to_wandb(drawn, read_metrics(folder))
             log.info("pictures: %s", drawn.page)
         except Exception as error:
-            log.warning(
-                "the run is finished, but its pictures failed (%s: %s); qs3 report page "
-                "run=%s draws them again",
-                type(error).__name__,
-                error,
-                folder,
-            )
+            why = f"{type(error).__name__}: {error}"
+            again = f"qs3 report page run={folder} draws them again"
+            log.warning("the run is finished, but its pictures failed (%s); %s", why, again)
 
 
 def _log_to_wandb(drawn: Drawn, metrics: RunMetrics | None) -> None:

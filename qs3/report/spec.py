@@ -80,15 +80,10 @@ class _Column:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Row:
-    """One row.
+    """One row: its cells by column, and how many seeds each should have.
 
-    Attributes:
-        name: of it.
-        cells: by column.
-        seeds: how many each cell should have.
-        factors: level of each factor, of rows that cross several, such as two selectors by two
-            schemes.
-        average: published average where it differs in the last digit from the numbers' mean.
+    `factors` has the level of each factor, of rows that cross several, such as two selectors by two
+    schemes; `average` is published, where the last digit is not that of the numbers' mean.
     """
 
     name: str
@@ -112,11 +107,9 @@ class Spec:
 
 
 def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[str, Spec]:
-    """A table's name and content.
+    """A table's name and content, with further rows as in the file.
 
-    Args:
-        name: of a file in conf/table, or the path of one's own, NAME.yaml.
-        more_rows: further ones, as in the file.
+    `name` is of a file in conf/table, or the path of one's own, NAME.yaml.
 
     Raises:
         ConfigError: there is no such table, or an entry is wrong.

@@ -78,16 +78,10 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A filled table.
+    """A filled table: cells by row name, in the order of `columns`.
 
-    Attributes:
-        name: of its file.
-        file_name: of its own files: with the target and the columns that were asked for.
-        log_dir: of its runs.
-        title, notes: for above and below it.
-        spec: its file.
-        columns: names of the tasks.
-        rows: cells by row name, in the order of `columns`.
+    `file_name` is of its own files, with the target and the columns that were asked for; `title`
+    and `notes` stand above and below it.
     """
 
     name: str

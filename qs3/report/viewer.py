@@ -51,11 +51,8 @@ class Shown:
 class Part:
     """Clouds that came together.
 
-    Attributes:
-        shown: in order.
-        about: what they are and how many there were, in a line.
-        unit: of their coordinates, such as "m"; "" if it is not known.
-        failed: what could not be read, each with its reason.
+    `about` is a line: what they are and how many there were; `unit` is of their coordinates, ""
+    if it is not known; `failed` is what could not be read, each with its reason.
     """
 
     shown: Sequence[Shown]
@@ -91,9 +88,6 @@ def viewer(parts: Sequence[Part], colour: str = "", points: int | None = None) -
         parts: of clouds, in order.
         colour: which comes first of height, class and confidence, if it is known.
         points: of each cloud, at most; None: what keeps the page below a megabyte or so.
-
-    Raises:
-        DataError: no clouds.
     """
     from matplotlib import colormaps
 
