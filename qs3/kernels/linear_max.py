@@ -21,11 +21,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qs3 import kernels as fast
+from qs3.kernels import compiled
 from qs3.kernels.device import implementation, lists_of, triton_kernels
-from qs3.kernels.pointwise_max import largest
+from qs3.kernels.matmul import matmul_t
+from qs3.kernels.pointwise_max import max_over_rows
 
 _op = torch.library.custom_op
 _TRITON = "triton_linear_max"
+_AT_ONCE = 1 << 22  # values of z at once on the CPU: 16 MB in float32
 
 
 @_op("qs3::linear_max_gradient", mutates_args=())
@@ -75,7 +78,15 @@ class _Pooled(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
-        most, where = (x @ weight.T).max(1)
+        if fast.on_cpu(x):
+            (b, n, _), d = x.shape, len(weight)
+            most, where = x.new_empty(b, d), torch.empty(b, d, dtype=torch.int64)
+            step = max(1, _AT_ONCE // (n * d))
+            for i in range(0, b, step):
+                y = matmul_t(x[i : i + step], weight)  # [step, n, d]
+                most[i : i + step], where[i : i + step] = max_over_rows(y)
+        else:
+            most, where = (x @ weight.T).max(1)
         centre = x.mean(1)  # [b, c]
         ctx.save_for_backward(x, weight, where, centre)
         return torch.cat([most, centre @ weight.T], dim=1)
@@ -85,7 +96,11 @@ class _Pooled(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
         x, weight, where, centre = ctx.saved_tensors
         grad = grad.to(x.dtype).contiguous()
-        mean = grad[:, len(weight) :]
+        most, mean = grad.chunk(2, dim=1)  # [b, d] each
+        if fast.on_cpu(x):
+            found = compiled.linear_max_backward(x, weight, most, where)
+            dx = (mean @ weight / x.shape[1])[:, None].expand_as(x).contiguous()
+            return dx.add_(found[0]), (mean.T @ centre).add_(found[1])
         first, order = lists_of(where, x.shape[1])
         at = implementation(__name__, _TRITON, x)
         dx = at.points_gradient(grad, weight, mean @ weight, first, order)
@@ -96,6 +111,4 @@ def pooled_linear(
     x: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]
 ) -> Float[Tensor, "b 2*d"]:
     """Maximum and mean over the points of a linear map without bias."""
-    if fast.on_cpu(x):
-        return torch.cat([largest(x, weight), x.mean(1) @ weight.T], dim=1)
     return _Pooled.apply(x.contiguous(), weight.contiguous())

@@ -106,20 +106,17 @@ class _Largest(torch.autograd.Function):
     def backward(ctx: Any, dbest: Tensor, dmean: Tensor, dvar: Tensor) -> tuple[Tensor | None, ...]:
         rows, weight, where, centre, covariance = ctx.saved_tensors
         b, c = len(where), rows.shape[1]
-        found = compiled.linear_max_backward(rows.view(b, -1, c), weight, dbest, where)
-        if centre is None:
-            return *found, None
-        slope = 2 * dvar / len(rows)
-        product = weight.T @ (weight * slope[:, None])  # [c, c], symmetric
-        dy = matmul_t(rows, product, (dmean / len(rows)) @ weight - centre @ product)
-        dweight = 2 * dvar[:, None] * (weight @ covariance.to(weight.dtype))
-        dweight += torch.outer(dmean, centre)
-        return dy.view(b, -1, c).add_(found[0]), dweight.add_(found[1]), None
-
-
-def largest(y: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]) -> Float[Tensor, "b d"]:
-    """Maximum over the points of a linear map; on the CPU."""
-    return _Largest.apply(y, weight, False)[0]
+        n = len(rows) // b
+        if centre is not None:
+            slope = 2 * dvar / len(rows)
+            product = weight.T @ (weight * slope[:, None])  # [c, c], symmetric
+            dy = matmul_t(rows, product, (dmean / len(rows)) @ weight - centre @ product)
+            dweight = 2 * dvar[:, None] * (weight @ covariance.to(weight.dtype))
+            dweight += torch.outer(dmean, centre)
+        else:
+            dy, dweight = torch.zeros_like(rows), torch.zeros_like(weight)
+        found = compiled.linear_max_backward(rows.view(b, n, c), weight, dbest, where)
+        return dy.view(b, n, c).add_(found[0]), dweight.add_(found[1]), None
 
 
 def normed_maximum(

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
-from qs3.kernels import grouped_mlp_max, plain, pointwise_max, rsconv
+from qs3.kernels import grouped_mlp_max, linear_max, plain, pointwise_max, rsconv
 from qs3.kernels.norms import use_domain
 from qs3.models.dgcnn import DGCNN, EdgeConv
 from qs3.models.pointnet import PointMLP
@@ -95,7 +95,7 @@ LAYERS = (edge_conv, pooled_conv5, point_mlp, grouped_mlp, rs_conv)
 def _many_parts() -> Iterator[None]:
     """Kernels work on parts of what they are given; here on small ones."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (grouped_mlp_max, pointwise_max, rsconv):
+        for module in (grouped_mlp_max, linear_max, pointwise_max, rsconv):
             patch.setattr(module, "_AT_ONCE", 1 << 7)
         yield
 
