@@ -5,7 +5,6 @@ Nothing here is read by training: no model is chosen and no threshold set by the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
 from qs3.errors import ConfigError, DataError
 from qs3.kernels.norms import use_trained
@@ -85,26 +83,6 @@ def said_of(
     return tuple(torch.cat(each) for each in zip(*parts, strict=True))
 
 
-def predict_rotated(
-    net: nn.Module,
-    points: Float[Tensor, "n p 3"],
-    turn: float,
-    batch_size: int,
-    device: Any = "cpu",
-) -> Float[np.ndarray, "n c"]:
-    """`predict` for clouds rotated about the up axis, by `turn` in radians."""
-    angle = torch.full((len(points),), turn, dtype=points.dtype)
-    return predict(net, rotate_z(points, angle), batch_size, device)
-
-
-def rotation_average(
-    of_turn: Callable[[float], Float[np.ndarray, "n c"]], rotations: int
-) -> Float[np.ndarray, "n c"]:
-    """Mean of the probabilities over `rotations` turns about the up axis: by 0, 2π/n, 4π/n, ..."""
-    total: Any = sum(of_turn(2 * math.pi * i / rotations) for i in range(rotations))
-    return total / rotations
-
-
 def calibration_error(
     probabilities: Float[np.ndarray, "n c"],
     labels: Int[np.ndarray, " n"],
@@ -160,7 +138,6 @@ class Evaluation:
         labels: theirs [n]; None if they are not known.
         train_labels: of its training clouds by id, which only judge pseudo-labels; None likewise.
         classes: names in label order.
-        rotations: over how many rotations `rotation_averaged` averages; 0 leaves it out.
         meshes: of the test clouds by id; None or missing where not known.
         tiers: likewise.
     """
@@ -171,13 +148,11 @@ class Evaluation:
         labels: Int[Tensor, " n"] | None,
         train_labels: Mapping[str, int] | None,
         classes: Sequence[str],
-        rotations: int = 0,
         meshes: Mapping[str, str] | None = None,
         tiers: Mapping[str, str] | None = None,
     ) -> None:
         self.test, self.classes = test, tuple(classes)
         self.y_target_eval = None if labels is None else labels.numpy()
-        self.rotations = rotations
         self._train, self._meshes = train_labels, meshes or {}
         self._tiers = np.array([(tiers or {}).get(id_, "") for id_ in test.ids])
 
@@ -211,14 +186,6 @@ class Evaluation:
             tier: scores(probabilities[chosen], self.y_target_eval[chosen], self.classes)
             for tier, chosen in of.items()
         } or None
-
-    def rotation_averaged(
-        self, of_turn: Callable[[float], Float[np.ndarray, "n c"]]
-    ) -> Scores | None:
-        """Scores of the mean over turns by `of_turn` (radians); None if `rotations` is 0."""
-        if not self.rotations:
-            return None
-        return self.scores_of(rotation_average(of_turn, self.rotations))
 
     def pseudo_labels(self, path: Path) -> PseudoLabelScores | None:
         """How right a round's pseudo-labels were: a diagnostic, computed when training is over.

@@ -83,7 +83,6 @@ class Evaluated:
     Attributes:
         split: "test"; "train" where there is no other.
         labels: whether the clouds' classes are known.
-        rotations: about the up axis, over which `..._over_rotations` average; 0: none.
         norms: as `evaluation.norms`.
         prior, prior_shares: how common classes counted as, in words and as numbers of sum 1.
         tiers: the final scores of the clouds of each tier ("clean", "hard": how much of the object
@@ -92,12 +91,9 @@ class Evaluated:
 
     split: str
     labels: bool
-    rotations: int
     norms: str
     prior: str = ""
     prior_shares: dict[str, float] | None = None
-    final_over_rotations: Scores | None = None
-    warmup_over_rotations: Scores | None = None
     tiers: dict[str, Scores] | None = None
 
 

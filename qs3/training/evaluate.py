@@ -19,7 +19,7 @@ from qs3.config import hashing
 from qs3.config.hydra import component_names
 from qs3.datamodules.clouds import Labelled
 from qs3.evaluation.expected import expected_accuracy, held_out
-from qs3.evaluation.metrics import predict, predict_rotated
+from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms, minimise_entropy
 from qs3.evaluation.ood import limits, ood_reasons_of_all, ood_share, source_limits
 from qs3.evaluation.prior import Prior
@@ -84,7 +84,7 @@ class SavedNets:
         # After `fit` Lightning moves the classifier to the CPU; the accelerator is still there.
         self.device = built.trainer.strategy.root_device
         self._nets: dict[tuple[str, str], nn.Module] = {}
-        self._predicted: dict[tuple[str, str, str, float], Float[np.ndarray, "n c"]] = {}
+        self._predicted: dict[tuple[str, str, str], Float[np.ndarray, "n c"]] = {}
         self._weights_in = cache(lambda file: weights_sha256(load(file)))  # equal ones are one net
 
     def __call__(self, file: Path, norms: str | None = None) -> nn.Module:
@@ -100,27 +100,22 @@ class SavedNets:
             self._nets[key] = net
         return self._nets[key]
 
-    def of(
-        self, which: str, file: Path, norms: str | None = None, turn: float = 0.0
-    ) -> Float[np.ndarray, "n c"]:
+    def of(self, which: str, file: Path, norms: str | None = None) -> Float[np.ndarray, "n c"]:
         """Probabilities of "test", "target" or "validation" clouds, by norms for their domain.
 
         Args:
             which: of `clouds`.
             file: with the weights.
             norms: of clouds of the target other ones than `evaluation.norms`.
-            turn: about the up axis, in radians.
         """
         norms, domain = norms or self.run.cfg.evaluation.norms, "target"
         if which == "validation" and self.data.owner == "source":
             norms, domain = TRAINED, "source"
-        key = self._weights_in(file), which, norms, turn
+        key = self._weights_in(file), which, norms
         if key not in self._predicted:
             more = self(file, norms), self.clouds[which].points
             how = self.run.cfg.data.eval_batch_size, self.device
-            self._predicted[key] = (
-                predict_rotated(*more, turn, *how) if turn else predict(*more, *how, domain=domain)
-            )
+            self._predicted[key] = predict(*more, *how, domain=domain)
         return self._predicted[key]
 
 
@@ -149,8 +144,8 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         met, said = warmups.get(weights, learnt), partial(nets.of, "target", weights)
         return prior_beside(cfg.evaluation, evaluation.classes, met, said)
 
-    def reported(weights: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
-        found, prior = nets.of("test", weights, turn=turn), prior_of(weights)
+    def reported(weights: Path) -> Float[np.ndarray, "n c"]:
+        found, prior = nets.of("test", weights), prior_of(weights)
         return prior(found) if prior else found
 
     scores = {name: evaluation.scores_of(reported(path)) for name, path in files.items()}
@@ -183,14 +178,9 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         evaluation=Evaluated(
             split=loaded.split,
             labels=evaluation.labelled,
-            rotations=evaluation.rotations,
             norms=cfg.evaluation.norms,
             prior=prior.words if prior else "",
             prior_shares=prior.shares if prior else None,
-            final_over_rotations=evaluation.rotation_averaged(partial(reported, file)),
-            warmup_over_rotations=evaluation.rotation_averaged(
-                partial(reported, files["selected"])
-            ),
             tiers=evaluation.scores_of_tiers(predictions.probabilities),
         ),
         warmup=Warmup(

@@ -138,7 +138,6 @@ def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
         labels_of(target, split) if split == "test" else None,
         None if known is None else dict(zip(ids, known.tolist(), strict=True)),
         target.classes,
-        cfg.evaluation.rotations,
         objects_by_id(rows, run.target),
         {row.id: tier for row in rows if (tier := row.more.get("tier"))},
     )

@@ -61,7 +61,6 @@ class Judging:
     norms: Literal["trained", "adabn", "alpha_bn", "tent"]
     prior: str | dict[str, float] | None
     prior_power: Annotated[float, Ge(0)]
-    rotations: Annotated[int, Ge(0)]
 
 
 @settings

@@ -7,14 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
 from qs3.evaluation.metrics import (
     Evaluation,
     calibration_error,
     predict,
-    predict_rotated,
-    rotation_average,
     scores,
 )
 
@@ -60,33 +57,6 @@ def test_prediction_is_deterministic_and_leaves_the_mode_alone():
     assert net.training
     assert np.array_equal(first, predict(net, points, 2))
     assert np.allclose(first.sum(axis=1), 1)
-
-
-class Net(nn.Module):
-    """Sees the direction of a cloud's first point."""
-
-    def forward(self, points: torch.Tensor) -> torch.Tensor:
-        return 3 * points[:, 0, :2]
-
-
-def turned(points: torch.Tensor, batch_size: int = 4):
-    """What `Net` says of the clouds after a turn."""
-    return lambda turn: predict_rotated(Net(), points, turn, batch_size)
-
-
-def test_mean_over_turns():
-    points = torch.nn.functional.normalize(torch.rand(6, 4, 3), dim=2)
-    net = Net()
-    assert np.array_equal(rotation_average(turned(points), 1), predict(net, points, 4))
-    by_hand = [
-        predict(net, rotate_z(points, torch.full((6,), angle)), 4)
-        for angle in (0.0, torch.pi / 2, torch.pi, 3 * torch.pi / 2)
-    ]
-    assert np.allclose(rotation_average(turned(points), 4), np.mean(by_hand, axis=0), atol=1e-6)
-    first = rotate_z(points, torch.full((6,), 2 * torch.pi / 12))
-    twelve = rotation_average(turned(points), 12)
-    assert np.allclose(twelve, rotation_average(turned(first), 12), atol=1e-6)
-    assert not np.allclose(predict(net, points, 4), predict(net, first, 4), atol=1e-2)
 
 
 @pytest.mark.parametrize("labelled", [True, False])

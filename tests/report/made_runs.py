@@ -53,9 +53,7 @@ def metrics(seed=0, accuracy=0.5, **changes):
         ),
         "loading": Loading(points=1024, scale="unit_ball", fps_starts=4, sampler="shuffled"),
         "final": scores(accuracy),
-        "evaluation": Evaluated(
-            split="test", labels=accuracy is not None, rotations=0, norms="trained"
-        ),
+        "evaluation": Evaluated(split="test", labels=accuracy is not None, norms="trained"),
         "warmup": Warmup(selected=before, last=before),
         "validators": {"infomax": 0.5},
         "quality": Quality(

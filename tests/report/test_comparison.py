@@ -55,9 +55,7 @@ def test_by_hand(tmp_path):
 
 def test_tiers_and_blocks_from_runs_and_from_a_kept_file(tmp_path):
     """Ten clean and ten hard clouds in four blocks of frames."""
-    known = Evaluated(
-        split="test", labels=True, rotations=0, norms="trained", tiers={"clean": scores(0.5)}
-    )
+    known = Evaluated(split="test", labels=True, norms="trained", tiers={"clean": scores(0.5)})
     rows = {"source only": 5, "DANN": 13}
     table = fill(
         tmp_path, str(tmp_path / "small.yaml"), rows, changes={"evaluation": known}, **BLOCKS

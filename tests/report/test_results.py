@@ -32,7 +32,7 @@ def test_tiers_are_averaged_where_every_seed_has_them(tmp_path):
     for seed, tiers in enumerate(
         ({"clean": scores(0.5)}, {"clean": scores(0.7), "hard": scores(0.2)})
     ):
-        known = Evaluated(split="test", labels=True, rotations=0, norms="trained", tiers=tiers)
+        known = Evaluated(split="test", labels=True, norms="trained", tiers=tiers)
         write_run(tmp_path, seed=seed, evaluation=known)
     assert runs(tmp_path).stat("accuracy_clean").mean == pytest.approx(0.6)
     assert runs(tmp_path).stat("balanced_accuracy_clean").mean == pytest.approx(0.5)

@@ -179,9 +179,7 @@ def test_numbers_that_are_not_there(tmp_path):
         "- {name: QS3, run: experiment=quickstart}\n"
         "- {name: PCM, run: experiment=quickstart, take: warmup}\n"
     )
-    known = Evaluated(
-        split="test", labels=True, rotations=0, norms="trained", tiers={"clean": scores(0.7)}
-    )
+    known = Evaluated(split="test", labels=True, norms="trained", tiers={"clean": scores(0.7)})
     for name, changes, shown in (
         ("a", {"evaluation": known}, ["70.0 ± 0.0", "51.0 ± 0.6", "-", "50.0 ± 0.0"]),
         ("b", {}, ["-", "51.0 ± 0.6", "-", "50.0 ± 0.0"]),

@@ -11,9 +11,7 @@ from qs3.runs.metrics import METRICS, Evaluated, read_metrics, write_metrics
 from tests.report.made_runs import metrics, scores
 from tests.training.conftest import finished, toy, toy_data  # noqa: F401 (fixtures)
 
-TIERS = Evaluated(
-    split="test", labels=True, rotations=12, norms="adabn", tiers={"hard": scores(0.25)}
-)
+TIERS = Evaluated(split="test", labels=True, norms="adabn", tiers={"hard": scores(0.25)})
 
 
 @pytest.mark.parametrize("made", [metrics(), metrics(accuracy=None), metrics(evaluation=TIERS)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import qs3
 from qs3.config import hashing
 from qs3.datamodules.clouds import load_clouds
 from qs3.errors import ConfigError
-from qs3.evaluation.metrics import predict, predict_rotated
+from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms
 from qs3.evaluation.prior import read_prior
 from qs3.inference.model_file import read_result
@@ -26,24 +25,17 @@ from qs3.training import evaluate as stage
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES, TinyNet, write_domain
 
-TURNS = {math.pi / 2: 1, math.pi: 1, 3 * math.pi / 2: 1}
-
 
 @pytest.fixture
 def passes(monkeypatch):
-    """Passes of the evaluation over sets of 24 clouds, the test set's size, by their turn."""
+    """Passes of the evaluation over sets of 24 clouds, the test set's size."""
     seen = Counter()
 
     def plain(net, points, *more, **named):
-        seen[0.0] += len(points) == 24
+        seen["test"] += len(points) == 24
         return predict(net, points, *more, **named)
 
-    def rotated(net, points, turn, *more):
-        seen[turn] += len(points) == 24
-        return predict_rotated(net, points, turn, *more)
-
     monkeypatch.setattr(stage, "predict", plain)
-    monkeypatch.setattr(stage, "predict_rotated", rotated)
     return seen
 
 
@@ -51,17 +43,17 @@ def passes(monkeypatch):
 # last epoch. With the target's norms the reported net is asked with those that it was trained with,
 # too.
 @pytest.mark.parametrize(
-    ("more", "nets", "rotated"),
+    ("more", "nets"),
     [
-        (("evaluation.rotations=4",), 3, 2),
-        (("selftraining=none", "evaluation.rotations=4", "evaluation.norms=adabn"), 3, 1),
-        (("selftraining=none", "protocol.epochs=1"), 1, 0),
+        ((), 3),
+        (("selftraining=none", "evaluation.norms=adabn"), 3),
+        (("selftraining=none", "protocol.epochs=1"), 1),
     ],
 )
-def test_equal_weights_predict_equal_clouds_once(toy, passes, more, nets, rotated):
+def test_equal_weights_predict_equal_clouds_once(toy, passes, more, nets):
     cfg = toy("force=true", *more)
     metrics = train(cfg)
-    assert +passes == {0.0: nets} | ({turn: rotated for turn in TURNS} if rotated else {})
+    assert +passes == {"test": nets}
     folder = hashing.run_folder(cfg)
     predictions = read_predictions(folder / FILE)
     right = (predictions.predicted == predictions.labels).mean()
@@ -118,7 +110,7 @@ def test_order_of_clouds_is_mixed_and_batches_are_even():
 
 PACKAGES = ("qs3.models", "tests")
 
-WORDS = ("method=source_only", "selftraining=none", "protocol.epochs=2", "evaluation.rotations=2")
+WORDS = ("method=source_only", "selftraining=none", "protocol.epochs=2")
 
 
 def test_the_reported_probabilities_are_weighed_and_estimates_are_not(toy) -> None:
@@ -135,7 +127,6 @@ def test_the_reported_probabilities_are_weighed_and_estimates_are_not(toy) -> No
     right = (of_told.probabilities.argmax(axis=1) == of_told.labels).mean()
     assert after.final.accuracy == pytest.approx(right)
     assert after.warmup.selected.scores == after.final
-    assert after.evaluation.final_over_rotations != before.evaluation.final_over_rotations
     assert after.evaluation.prior == prior.words
     assert before.evaluation.prior == ""
     assert "; with evaluation.prior; data: " in headline(after)
@@ -178,7 +169,7 @@ def test_classes_count_as_the_net_met_them_and_load_does_the_same(toy, uneven: P
 
 def test_a_student_has_met_its_pseudo_labels(toy, uneven: Path) -> None:
     """From scratch and without the source; beside it, the mean of both."""
-    rounds = ("method=source_only", "protocol.epochs=2", "evaluation.rotations=0")
+    rounds = ("method=source_only", "protocol.epochs=2")
     factors, run = factors_of(toy, uneven, *rounds)
     selected = read_metrics(run).rounds[-1].selected
     counts = np.array([selected[name] for name in CLASSES]) + 1.0

@@ -52,7 +52,7 @@ def test_metrics_and_files(finished):
         points=32, scale="unit_ball", fps_starts=4, sampler="shuffled"
     )
     assert metrics.selection.validation == "lineage"
-    assert metrics.evaluation == Evaluated(split="test", labels=True, rotations=0, norms="trained")
+    assert metrics.evaluation == Evaluated(split="test", labels=True, norms="trained")
     rows = table(finished / "round_00" / "pseudo_labels.csv")
     kept = [row for row in rows if row["selected"] == "1"]
     assert (len(rows), len(kept)) == (72, metrics.rounds[0].total_selected)
@@ -102,7 +102,7 @@ WRONG = (
     "seed=null", "seed=-1", "protocol.epochs=0", "protocol.epochs=abc", "protocol.batch_size=1",
     "protocol.smoothing=1", "protocol.schedule=step", "protocol.regulariser=-1", "+warmup=3",
     "+protocol.epoch=3", "data.points=65", "selection.teacher=best", "selection.teacher=given",
-    "selection.student=best", "evaluation.norms=ada", "evaluation.rotations=-1",
+    "selection.student=best", "evaluation.norms=ada",
     "evaluation.prior_power=-1", "evaluation=null", "force=no", "objective=accuracy",
     "experiment_name=a/b", "experiment_name=..", "num_classes=10", "selftraining.theta=1.5",
     "selftraining.rounds=abc", "protocol.augment.crop=2", "data.scale=metres",
