@@ -4,8 +4,6 @@ Shadows are measured on who sees and who lights the wall, so they test geometry 
 measured on the disparity map (the depth image of a sensor without one).
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from typing import Any
 

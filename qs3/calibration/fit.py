@@ -1,7 +1,5 @@
 """A sensor preset from depth images of a flat wall: `qs3 fit --help`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

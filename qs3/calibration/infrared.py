@@ -5,8 +5,6 @@ where dots lie (`statistics`). The differentiable twin of the preset makes pictu
 wall, with fixed random numbers for the noise, and least squares follows its gradients.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

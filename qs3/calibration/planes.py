@@ -6,8 +6,6 @@ looked at; the nearest and farthest 0.5 % of the points are dropped and a plane 
 RMS is that of f B / Z - f B / Z_plane, and Z accuracy the median of the signed error.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A plane is linear in 1 / Z over the pixels of an image, so all fits are linear a
 those of a disparity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Which object of which family a catalogue holds; the families are in one module per class.
 """
 
-from __future__ import annotations
-
 from functools import cache, partial
 from importlib import import_module
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Bathtubs: free-standing, built in, on claw feet, raised at the ends, in corners."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Beds: platforms and box springs, iron beds, cots, bunks and futons; the head is at +y."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from qs3.catalogue import furniture as f

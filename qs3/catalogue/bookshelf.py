@@ -1,7 +1,5 @@
 """Bookshelves: open cases, cube grids, low and half-closed ones, racks, ladders and corners."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

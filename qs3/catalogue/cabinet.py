@@ -1,7 +1,5 @@
 """Cabinets: night stands, chests, wardrobes, sideboards, kitchens, filing, display, hutches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from qs3.catalogue import parts as p

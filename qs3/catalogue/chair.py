@@ -1,7 +1,5 @@
 """Chairs: dining, easy and office chairs, visitors' chairs of bent tube, upholstered ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

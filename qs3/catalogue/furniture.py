@@ -1,7 +1,5 @@
 """What all families share: their random choices, legs, bent tubes, curved backs, upholstery."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

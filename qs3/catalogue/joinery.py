@@ -3,8 +3,6 @@
 Most cabinets and bookshelves are made of them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Lamps: floor and table lamps with shades, jointed, bent and spot lamps."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from qs3.catalogue import parts as p

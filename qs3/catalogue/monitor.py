@@ -1,7 +1,5 @@
 """Monitors: flat screens on stands, tubes, televisions, all-in-ones; the screen faces -y."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from qs3.catalogue import furniture as f

@@ -4,8 +4,6 @@ Metres, z up. `at` is the centre of the part's lower face unless said otherwise.
 solids are lofts: a stack of rings of equally many points, closed by a fan at both ends.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plants in pots and vases, from grass to a small tree."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from qs3.catalogue import parts as p

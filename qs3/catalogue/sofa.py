@@ -1,7 +1,5 @@
 """Sofas: cushioned, L-shaped, buttoned, with an open frame, curved, folding; front along -y."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

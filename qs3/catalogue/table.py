@@ -1,7 +1,5 @@
 """Tables: dining, coffee, round and lounge tables, desks."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from qs3.catalogue import furniture as f

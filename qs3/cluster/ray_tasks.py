@@ -6,8 +6,6 @@ counted here and not by Ray, because who ended the process matters: a task that 
 times is given up, one whose node was lost is not to blame.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -4,8 +4,6 @@ Each check runs in a process of its own, because a library that does not fit (an
 LLVM, a missing X library) may end the process.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

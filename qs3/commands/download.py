@@ -1,7 +1,5 @@
 """`qs3 download` and `qs3 scannet`: published datasets, put where their domain looks for them."""
 
-from __future__ import annotations
-
 import os
 import textwrap
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`qs3 inspect`, `qs3 compare` and `qs3 view`: what datasets are like, and what they look like."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """`qs3 predict` and `qs3 export`."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Annotated, Any

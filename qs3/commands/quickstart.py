@@ -4,8 +4,6 @@ Sizes are chosen to fit into 8 minutes on 2 idle cores; the paper's are in
 conf/experiment/qs3_s2d.yaml.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

@@ -1,7 +1,5 @@
 """`qs3 bench` and `qs3 fit`: depth sensors before known targets, and a preset for one's own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

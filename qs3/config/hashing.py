@@ -1,7 +1,5 @@
 """The hash of a config, which names a run's folder: the same command always finds its own run."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

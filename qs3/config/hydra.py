@@ -5,8 +5,6 @@ Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_i
 `${qs3.choices:GROUP}`, `${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import textwrap

@@ -4,8 +4,6 @@ In a checkout these are conf/, train.py and generate.py; a wheel holds conf/ as 
 installs the commands as qs3-train and qs3-generate.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Two `DomainData` and which of them a batch is taken from. The target's test clou
 at all: only `qs3.evaluation.metrics` holds them.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -4,8 +4,6 @@ There are no worker processes: a batch is one indexing into mapped files, and au
 on the device. So there is nothing that the number of workers could change.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 

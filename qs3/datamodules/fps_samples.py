@@ -5,8 +5,6 @@ points once, by several processes, and an epoch draws one of these samples for e
 an index. Imports no torch, so that the processes need not.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import logging

@@ -3,8 +3,6 @@
 Light (no torch), so that a wrong setting is an error within a second of starting.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from decimal import Decimal

@@ -4,8 +4,6 @@ Further scans of an object (`generate.py scans=N` calls them id~1, id~2, ...) go
 else training would see the validation shapes.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from types import MappingProxyType

@@ -12,8 +12,6 @@
 Only x y z are read. Pickled arrays are refused unopened.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import logging

@@ -17,8 +17,6 @@ axis; the centre of the top left pixel is at (0, 0). MATLAB counts pixels from 1
 point from there is one pixel less here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -3,8 +3,6 @@
 Light on purpose: `train.py` asks `Domain.check` before it imports anything heavy.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import shlex

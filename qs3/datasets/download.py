@@ -4,8 +4,6 @@ Training never downloads. What there is, what it is for and under which terms st
 sources.yaml, which explains its keys.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -6,8 +6,6 @@ and an interrupted import goes on where it stopped; other settings begin anew. T
 from many frames of a scene.
 """
 
-from __future__ import annotations
-
 import abc
 import functools
 import logging

@@ -5,8 +5,6 @@ are and reads them to clouds and manifest rows. Clouds keep their published scal
 only the axes are turned so that z is up.
 """
 
-from __future__ import annotations
-
 import abc
 import dataclasses
 import functools

@@ -4,8 +4,6 @@ Scans of one object, known by its id, stay together in validation (they are call
 as `generate.py scans=N` does). Each is as it is stored: coordinates are not scaled.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

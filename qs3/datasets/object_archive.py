@@ -17,8 +17,6 @@ Frames in a row show one room: objects of one block of frames are not independen
 archive that judges is blocks away from one that is trained on.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import logging

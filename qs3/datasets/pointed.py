@@ -10,8 +10,6 @@ Of a box, the object is what lies in it and not on the plane it stands on, and o
 that do not go on outside the box, as floors and walls do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Published datasets of clouds: trees of files, `<class>/<split>/*`, and files of many clouds."""
 
-from __future__ import annotations
-
 import abc
 import dataclasses
 import functools

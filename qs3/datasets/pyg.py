@@ -10,8 +10,6 @@ PyG is imported here and nowhere else in qs3.datasets: import this module when y
 neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges from ours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 

@@ -14,8 +14,6 @@ the mask's resolution. What the colour camera cannot see, because something near
 there and not from the depth camera, gets no mask pixel: it would get the label of what hides it.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

@@ -22,8 +22,6 @@ lies in the table's box, too, and what stands on a table is cut with it. Nor can
 column of the manifest is 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path, PurePosixPath

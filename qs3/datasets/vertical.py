@@ -7,8 +7,6 @@ Planes: the direction to which most surfaces are parallel or perpendicular, from
 on (Gupta, Arbeláez, Malik, CVPR 2013, whose published rotations of NYU Depth V2 were found so).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float

@@ -1,7 +1,5 @@
 """Checkpoints of each epoch, written atomically, read without pickles; and what a run takes."""
 
-from __future__ import annotations
-
 import resource
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The LightningModule: a net, the method's loss in the warm-up, the student's in the rounds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -6,8 +6,6 @@ start of a run writes an offline log of wandb of its own, and a kill may leave n
 each log begins with the rows of earlier starts, or of a shared warm-up.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import logging

@@ -12,8 +12,6 @@ is known: least squares of the logits, each target counting the same. Of the ter
 target that is left out.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

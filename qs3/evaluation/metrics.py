@@ -3,8 +3,6 @@
 Nothing here is read by training: no model is chosen and no threshold set by these figures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

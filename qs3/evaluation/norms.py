@@ -3,8 +3,6 @@
 Controls: no other weight is trained, and no source cloud is needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -6,8 +6,6 @@ training clouds of source and target lie. A cloud inside all ranges can still sh
 known class, and get a confident answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 import numpy as np

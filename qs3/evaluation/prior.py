@@ -12,8 +12,6 @@ t as a choice is Menon et al., "Long-tail learning via logit adjustment", ICLR 2
 `estimate_shares` finds q from clouds without labels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -12,8 +12,6 @@ Rules of `selection.student`, by name:
 The earliest epoch wins a tie.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -5,8 +5,6 @@ hidden where it is used: of a chair at a table the back alone is seen, of a tabl
 top and of that what no thing stands on, of a lamp among books the shade.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated

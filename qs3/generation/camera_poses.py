@@ -1,7 +1,5 @@
 """Where the camera stands: the paper's pose law and a hand-held walk around the object."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 import numpy as np

@@ -3,8 +3,6 @@
 Light to import: renderers live in worker processes only.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time

@@ -1,7 +1,5 @@
 """What bodies are made of, and the light of the place where they are scanned."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated

@@ -3,8 +3,6 @@
 What is written down decides the bytes of a dataset: a resume is compared with it.
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import functools

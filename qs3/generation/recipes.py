@@ -6,8 +6,6 @@ and its dropout variant are. Both are plain values, so that they can be sent to 
 written into a dataset's recipe file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Protocol

@@ -8,8 +8,6 @@ are its law of poses, its box around an object, and `poses=PATH`, the poses that
 what makes numpy's arrays is let through. Nothing is unpacked to the disk.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import pickle

@@ -5,8 +5,6 @@ stands in a room, the object is somewhere in the picture, other things cover a p
 annotator draws its mask, and `qs3.datasets.cutting` cuts by the same rules as it does there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field, replace
 from typing import Annotated, Literal

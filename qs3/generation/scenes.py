@@ -1,7 +1,5 @@
 """What stands around the object: nothing (the paper), or a floor with clutter and occluders."""
 
-from __future__ import annotations
-
 from dataclasses import field
 from typing import Annotated, Protocol, runtime_checkable
 

@@ -6,8 +6,6 @@ worker each time is reported as failed. What became of an object is saved as a p
 unfinished dataset (`qs3.store.parts`), by the worker where it can.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

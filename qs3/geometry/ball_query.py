@@ -6,8 +6,6 @@ than `count` of them is filled up with the first one. So the result depends on t
 points, and a full ball is a biased sample of its neighbourhood.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

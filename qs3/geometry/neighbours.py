@@ -3,8 +3,6 @@
 Written here because torch-cluster is deprecated and pyg-lib is not on PyPI.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int

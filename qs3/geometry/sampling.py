@@ -1,7 +1,5 @@
 """Points of clouds and surfaces: farthest point sampling, area sampling, the unit ball. Numpy."""
 
-from __future__ import annotations
-
 import fpsample
 import numpy as np
 from jaxtyping import Float, Int

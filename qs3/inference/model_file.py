@@ -12,8 +12,6 @@ must be one of `qs3.models`. Classifiers that come with qs3 are such folders, fo
 none has seen a real scan.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import importlib

@@ -4,8 +4,6 @@ One HTML file with its pictures inside. With labels the errors come first, the m
 before the others; without, what is in doubt.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """`qs3 predict`: clouds predicted in batches by several threads, and what is printed about them."""
 
-from __future__ import annotations
-
 import contextlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence

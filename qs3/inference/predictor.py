@@ -7,8 +7,6 @@ test clouds of a run get the probabilities of its predictions.csv; with `evaluat
 gets the same.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The table of `qs3 predict`, a row for each object, and how many are right by their labels."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

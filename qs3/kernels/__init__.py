@@ -6,8 +6,6 @@ only where the kernel saves what an accelerator lacks, too: most are made for a 
 many small parts, of which each would be started there by itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -4,8 +4,6 @@ By torch's operations the gathered rows are written and read again, k times the 
 here it is one loop. For float32 and float64 on the CPU; elsewhere callers go by torch's operations.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

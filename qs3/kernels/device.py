@@ -1,7 +1,5 @@
 """Which way an operation goes: by numpy, by kernels of this processor or GPU, into a graph."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

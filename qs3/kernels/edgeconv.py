@@ -22,8 +22,6 @@ each started by itself; there `edge_norm` takes the statistics on its way over t
 it is not at hand z_ij is written out for them, in 30.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -6,8 +6,6 @@ torch's compiler uses; where it is missing, or for other types and devices, thes
 products. `matmul_t` and `t_matmul` are for the inside of autograd functions, `linear` for outside.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -10,8 +10,6 @@ Which domain a pass is on is said around it: `with use_domain(net, "target"): ne
 evaluation `use_trained` instead.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Literal

@@ -4,8 +4,6 @@ Each works on a range, so that threads can share it: of rows, or, where rows add
 Inner loops begin at 0: an index that may be negative keeps LLVM from using vectors.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

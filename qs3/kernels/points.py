@@ -6,8 +6,6 @@ registers and to take its least value k times. On a GPU each is one kernel (`tri
 Triton, which comes with torch's builds for it; elsewhere the operations take the steps themselves.
 """
 
-from __future__ import annotations
-
 from typing import Any, no_type_check
 
 import torch

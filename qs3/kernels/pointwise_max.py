@@ -10,8 +10,6 @@ of y: mean(z) = W mean(y), var(z) = diag(W cov(y) W'). Backwards
 so that dy and dW are products of the input's width, and a row for each entry of D.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

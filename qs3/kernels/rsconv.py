@@ -15,8 +15,6 @@ tensors [B, M, K, C]. Here, with the same sums:
       weight_j (dmean + 2 (p_j - mean) dvar) / slots.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 

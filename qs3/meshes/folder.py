@@ -14,8 +14,6 @@ them. Hidden files, `__MACOSX` and files that are not meshes are ignored. Nothin
 looks like a mesh and lies in a class where it cannot be understood: that is an error.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterator, Sequence

@@ -4,8 +4,6 @@ Axes and units are the file's own, with one exception: glTF and 3MF state which 
 meshes are turned to z up (and 3MF's are scaled to metres).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

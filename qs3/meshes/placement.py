@@ -1,7 +1,5 @@
 """How an object is put into the world before it is scanned."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Protocol, runtime_checkable

@@ -6,8 +6,6 @@ ears: an ear is a corner whose triangle lies within the polygon (Meisters, 1975)
 in the plane of two axes that the polygon's normal, by Newell's formula, is farthest from.
 """
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Iterator

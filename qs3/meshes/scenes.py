@@ -7,8 +7,6 @@ in one place, and loses instances of deeply nested assemblies.
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, https://github.com/3MFConsortium/spec_core
 """
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -11,8 +11,6 @@ trimesh 5.2 gives other triangles of them, silently:
   are mixed, which is what Blender writes.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """The bounds of every table: source only, and supervised on the target's training labels."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch

@@ -4,8 +4,6 @@ Zou et al., "Bridging Simulation-to-Reality Domain Gap via Topology-Aware Repres
 arXiv 2506.21165, one of its losses. Points are exchanged for those that match them.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar
 

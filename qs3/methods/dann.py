@@ -4,8 +4,6 @@ Ganin et al., "Domain-Adversarial Training of Neural Networks", JMLR 2016. Gradi
 identity forward, and minus alpha times the gradient backward (section 3.3, eq. 16-18).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar, Literal
 

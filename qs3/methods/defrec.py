@@ -7,8 +7,6 @@ Network for 3D Object Reconstruction from a Single Image", CVPR 2017, eq. 1, wit
 sums.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch

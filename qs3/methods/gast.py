@@ -4,8 +4,6 @@ Zou et al., "Geometry-Aware Self-Training for Unsupervised Domain Adaptation on 
 Clouds", ICCV 2021. The self-training that completes it is `selftraining=spst`.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, ClassVar
 
 import torch

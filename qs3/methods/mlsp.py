@@ -3,8 +3,6 @@
 Liang et al., "Point Cloud Domain Adaptation via Masked Local 3D Structure Prediction", ECCV 2022.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, ClassVar
 
 import torch

@@ -6,8 +6,6 @@ SHA-256 is in the run's config: so the run's hash knows the method, and an edite
 run, never the same one gone on with.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from pathlib import Path

@@ -4,8 +4,6 @@ Achituve, Maron, Chechik, "Self-Supervised Learning for Domain Adaptation on Poi
 2021. The cross-entropy of mixed clouds takes the place of that of whole ones.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

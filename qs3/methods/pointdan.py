@@ -5,8 +5,6 @@ NeurIPS 2019; the discrepancy is that of Saito et al., "Maximum Classifier Discr
 that of nodes of Gretton et al., "A Kernel Two-Sample Test", JMLR 2012, eq. 5 (the biased estimate).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, ClassVar
 

@@ -6,8 +6,6 @@ clouds, is `selftraining=sd`. The teacher's weights are running means of the stu
 Valpola, "Mean teachers are better role models", NeurIPS 2017.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Annotated, Any, ClassVar, Literal

@@ -4,8 +4,6 @@ Ours: a simulation can scan an object again. Of what else it knows (whole object
 error) nothing helped on real objects: docs/results/tried.md.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 

@@ -1,7 +1,5 @@
 """What all backbones share: features of a cloud, and a head that turns them into logits."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import torch

@@ -9,8 +9,6 @@ Three variants, chosen by `variant`; parameters are with the class head for 10 c
   "simpleview", the maximum alone, biases in the whole head. 2,079,635 parameters.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import torch

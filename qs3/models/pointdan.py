@@ -4,8 +4,6 @@ Qin et al., "PointDAN: A Multi-Scale 3D Domain Adaption Network for Point Cloud 
 NeurIPS 2019: PointNet with a module of self-adaptive nodes between its layers.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, NamedTuple
 
 import torch

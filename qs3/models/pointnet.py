@@ -9,8 +9,6 @@ Three variants, chosen by `variant`; parameters are with the class head for 10 c
 - "basic": of DGCNN's repository, without T-Nets and with a head of one hidden layer. 680,778.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Literal
 

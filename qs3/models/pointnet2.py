@@ -5,8 +5,6 @@ Without normals and without biases before norms: 1,464,650 (SSG) and 1,735,146 p
 sampling in the net starts at point 0, so the order of the points matters a little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

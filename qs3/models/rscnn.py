@@ -9,8 +9,6 @@ d = xj - xi; what it is in code is the switch `relation`:
 - "paper": h as the paper has it, in absolute coordinates, on balls as in "released".
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import torch

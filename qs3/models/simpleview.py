@@ -20,8 +20,6 @@ A point fills one pixel: row ceil(u - 1/2) with u = (row coordinate / depth + 1)
 column likewise. Points behind the camera or outside the frame are dropped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated, Literal
 

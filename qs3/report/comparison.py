@@ -4,8 +4,6 @@ Both rows are judged on the same clouds with the same seeds, so a difference is 
 with an interval over seeds and over what test clouds share (`qs3.report.intervals`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Datasets as commands name them, and clouds of them to be shown."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A table as text, Markdown and CSV, with the lines that belong below it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, get_args

@@ -19,8 +19,6 @@ Methodology 2002, for a mean). A class seen in one cluster alone adds nothing to
 the interval is then too narrow.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ clusters, and seeds vary, too (`qs3.report.intervals`). Each cloud is thinned to
 run was trained with. Nothing is trained, chosen or tuned by what comes out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -7,8 +7,6 @@ The experiment, the columns and the seeds of a row of one's own are the table's,
 trained, evaluated and compared as all other rows are.
 """
 
-from __future__ import annotations
-
 import json
 import shlex
 import subprocess

@@ -7,8 +7,6 @@ percent, or [mean, SEM]. An entry under a column's name, `<column>: {run:, paper
 that cell alone.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

@@ -4,8 +4,6 @@ Composing the command of a cell gives the config hash by which the runs of its s
 the log folder; runs of a kept file are found by row, column and seed. `formats` prints.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 import shlex

@@ -1,7 +1,5 @@
 """`qs3 view`: from paths to a page of clouds; what each path is, and which clouds are shown."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -4,8 +4,6 @@ A page of 50 clouds of 2,048 points has less than a megabyte. Names are data in 
 HTML.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ with a checksum (CRC-32) of each tensor and never looks at it, so that a flipped
 another weight; here it is compared whenever a file is read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

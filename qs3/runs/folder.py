@@ -19,8 +19,6 @@ written last, and atomically: it is the mark of a finished run.
         pictures/            of the above, drawn last; see `qs3.report.run_page`
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

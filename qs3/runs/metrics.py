@@ -4,8 +4,6 @@ Shares and accuracies are in [0, 1]. A figure that does not exist is null: witho
 target there is no accuracy, and of a net that has diverged there is no finite score.
 """
 
-from __future__ import annotations
-
 from dataclasses import field
 from pathlib import Path
 from typing import Literal

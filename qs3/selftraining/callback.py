@@ -11,8 +11,6 @@ checkpoints are written in between, and must hold the trained model. Whether a r
 follows from the epoch alone, so there is no flag that a resume could lose.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import logging
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ Self-Training", ECCV 2018; Zou et al., "Confidence Regularized Self-Training", I
 about pixels; what is done here with clouds is said in the docstrings.
 """
 
-from __future__ import annotations
-
 import math
 from decimal import Decimal
 from typing import Annotated, Literal

@@ -4,8 +4,6 @@ Cardace et al., "Self-Distillation for Unsupervised 3D Domain Adaptation", WACV 
 leaves open is as in its released code. Its first step is `qs3.methods.sd`.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

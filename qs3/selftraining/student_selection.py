@@ -9,8 +9,6 @@ It only looks: with every rule but `pseudo_val` the run trains as with `last`, t
 `pseudo_val` as far as the last round. Target labels cannot be reached from here.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Depth sensors: what one is asked for, what it gives back, and what all of them share."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import ClassVar

@@ -8,8 +8,6 @@ soft argmax (Kendall et al., GC-Net, ICCV 2017, section 3.4) near the best whole
 rounding to grey values passes gradients through.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

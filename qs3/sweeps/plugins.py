@@ -1,7 +1,5 @@
 """Plugins of Hydra: a sweeper that runs the jobs of a file, and `hydra/launcher=ray`."""
 
-from __future__ import annotations
-
 import json
 import logging
 from abc import abstractmethod

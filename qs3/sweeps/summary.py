@@ -4,8 +4,6 @@ With `objective=`, by which the runs of a grid or a search are compared without 
 the objective of each instead of accuracies, and refuses beforehand to vary how runs are judged.
 """
 
-from __future__ import annotations
-
 import atexit
 import concurrent.futures.thread  # noqa: F401  pandas needs it, too late at exit: see `_summarise`
 import json

@@ -6,8 +6,6 @@ For the notebooks and for trying things out. Its numbers say nothing about scans
     train(*toy_overrides("toy"), "seed=1")  # qs3.api
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

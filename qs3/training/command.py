@@ -1,7 +1,5 @@
 """The story of the train command, top to bottom."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

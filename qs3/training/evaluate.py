@@ -1,7 +1,5 @@
 """Last stage: what the nets of a run are worth, from the weights that it saved; its result."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable

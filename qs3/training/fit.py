@@ -1,7 +1,5 @@
 """A run is trained: load the data, build net and trainer, fit."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

@@ -1,7 +1,5 @@
 """First stage: the datasets, what training may see of them, and what evaluation holds."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ qs3 stays while they do: so hashes of the code that a run executes are compared,
 torch before it is needed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

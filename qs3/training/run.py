@@ -1,7 +1,5 @@
 """One run: the one place where a config of `train.py` is judged, before torch is imported."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -12,8 +12,6 @@ replaced. Who copies holds a lock there, which ends with its process: of runs th
 the first gives its warm-up, and who comes meanwhile waits for whole files.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -13,8 +13,6 @@ Parameters before the `*` also take words without "="; `*words` takes any number
 imported only when a command runs or shows its help.
 """
 
-from __future__ import annotations
-
 import difflib
 import functools
 import inspect

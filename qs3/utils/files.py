@@ -5,8 +5,6 @@ the final name. A reader sees the old file or the new one, never a mixture. A ki
 a temporary file, which `remove_leftovers` clears.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Locks between processes, gone when the process ends."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

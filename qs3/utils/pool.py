@@ -4,8 +4,6 @@ Each worker has its own pipe and one task at a time: a process that is killed in
 message spoils no other one, and which task it had is known.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle

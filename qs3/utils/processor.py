@@ -7,8 +7,6 @@ busy process a core took 5 to 12 times as long as alone, and 1 to 3 times where 
 alone, a step is up to a quarter longer.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable

@@ -5,8 +5,6 @@ Every use of chance in training owns a seed: a function of the run's seed and of
 resume, another number of workers or another job in the same process therefore change nothing.
 """
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

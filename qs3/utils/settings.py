@@ -10,8 +10,6 @@ Ranges are those of `annotated_types` (Ge, Gt, Le, Lt, Interval). `qs3.config.hy
 pydantic error into a ConfigError that names the place in the config; elsewhere it is a ValueError.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar, dataclass_transform

@@ -1,7 +1,5 @@
 """Tables of words, header first, as aligned text, Markdown and CSV."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """The version, where a module that writes it down need not import the whole face of qs3."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from functools import cache

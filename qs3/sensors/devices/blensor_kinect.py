@@ -12,8 +12,6 @@ image, that the noise field is band-limited, and its size in pixels: 0.06 px rms
 gradient noise of strength 0.25.
 """
 
-from __future__ import annotations
-
 from dataclasses import field
 from itertools import product
 from typing import Annotated, ClassVar

@@ -4,8 +4,6 @@ That is all that depth frames can tell; the speckle sensors, whose noise comes o
 images, need more. `qs3 fit` writes presets of this sensor.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated, ClassVar
 

@@ -24,8 +24,6 @@ A view costs one render and one exposure a slide, and one render to know where t
 samples lie in their pixels. The scene must stand still meanwhile, as it does here.
 """
 
-from __future__ import annotations
-
 from dataclasses import field
 from functools import cached_property
 from typing import Annotated

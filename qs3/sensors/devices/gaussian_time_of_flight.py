@@ -5,8 +5,6 @@ error on the distance, and, if wanted, distances folded back into the range that
 frequency can tell apart. For physics see qs3.sensors.devices.time_of_flight.
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

@@ -6,8 +6,6 @@ was stored with a plane at Z_ref, at u_ref = f (b / Z_ref + s) + cx. So the disp
 u - u_ref = f b (1 / Z - 1 / Z_ref) (Khoshelham and Elberink, Sensors 2012, eq. 1 to 5).
 """
 
-from __future__ import annotations
-
 from dataclasses import field
 from functools import cached_property
 

@@ -9,8 +9,6 @@ Repaired with respect to the released code: pixel centres (it is off by half a p
 after its down-sampling, by up to two), and StereoBM's bias of 0.029 px.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import field, replace
 from typing import Annotated

@@ -26,8 +26,6 @@ Not simulated: light that bounces between surfaces (multipath), because renderer
 it went; higher harmonics of the modulation; motion between buckets.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

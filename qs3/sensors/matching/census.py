@@ -8,8 +8,6 @@ before on it,
 and the sum of L over all paths takes the place of C.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import cv2

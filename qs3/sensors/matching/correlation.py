@@ -1,7 +1,5 @@
 """Matching by normalised correlation."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import cv2

@@ -1,7 +1,5 @@
 """What devices do to a disparity map after matching: quantise it, and drop what looks wrong."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Annotated, Protocol, runtime_checkable
 

@@ -1,7 +1,5 @@
 """Loops over scores of disparities, compiled. Imported only when needed: numba is slow to load."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Block matching of two images by the sum of absolute differences: OpenCV's StereoBM."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import cv2

@@ -1,7 +1,5 @@
 """From radiance to the 8-bit image that a matcher sees: exposure, shot and read noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 

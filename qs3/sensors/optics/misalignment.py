@@ -1,7 +1,5 @@
 """What a factory's calibration leaves: rows and columns that do not meet."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

@@ -5,8 +5,6 @@ Kinect v1 pattern (3 x 3 tiles of 211 x 165 dots positions, about 11 % lit) enla
 ours have the same statistics and are drawn from a seed, so that nothing vendor-made is needed.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Annotated
 

@@ -4,8 +4,6 @@ A point lamp at another place with a white slide lights exactly what can be seen
 renderer answers, with its own geometry.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from enum import IntEnum

@@ -4,8 +4,6 @@ The only place that imports bpy. One process holds one Blender with global state
 builds its own data, renders, and removes it, so nothing is left for the next call.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

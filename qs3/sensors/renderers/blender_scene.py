@@ -1,7 +1,5 @@
 """A scene's bodies and lights in Blender. `bpy` is handed on: `blender` alone imports it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

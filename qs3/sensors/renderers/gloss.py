@@ -13,8 +13,6 @@ mean over the facets that are seen from o. A metal has no Lambertian part, and F
 albedo) (1 - o . h)^5 (Schlick). Light is not passed on from facet to facet.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Annotated
 

@@ -6,8 +6,6 @@ renders a small scene in a child process. The answer is kept in the environment 
 `QS3_MITSUBA_PROBE`, so worker processes inherit it and do not probe again.
 """
 
-from __future__ import annotations
-
 import ctypes
 import ctypes.util
 import functools

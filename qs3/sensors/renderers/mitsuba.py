@@ -7,8 +7,6 @@ costs more than the render. The scalar variant cannot trace kernels: Mitsuba's `
 and its `projector` emitter do the same there.
 """
 
-from __future__ import annotations
-
 import os
 from importlib.metadata import version
 from typing import Any

@@ -1,7 +1,5 @@
 """The reflecting facets of `gloss`, for Mitsuba's compiled variants."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Mitsuba's scalar variants: its own integrators and its own emitter do what our kernel does."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
