@@ -280,9 +280,9 @@ def check_selection(
     missing = [name for name, n in zip(class_names, selection.kept, strict=True) if n == 0]
     total = int(selection.kept.sum())
     if total <= processes or (missing and missing_class == "error"):
-        lack = "" if total <= processes else f", none for {', '.join(missing)}"
         raise SelectionError(
-            f"round {round_}: {total} pseudo-labels above theta={selection.theta:g}{lack}; lower "
-            "the threshold, or train the teacher for longer"
+            f"round {round_}: {total} pseudo-labels above theta={selection.theta:g}, none for "
+            f"{', '.join(missing) or 'none of the classes'}; lower the threshold, or train the "
+            "teacher for longer"
         )
     return missing

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from fractions import Fraction
 
 import numpy as np
@@ -127,6 +127,15 @@ def test_what_is_kept_is_counted_by_the_mask():
     assert chosen_by(Own(), teacher, 0.5, 0).kept.tolist() == [0, 2]
 
 
+def test_predictions_and_selections_are_told_apart_by_identity_and_stay_as_they_are():
+    teacher = TeacherPredictions.of(np.array([[0.9, 0.1], [0.4, 0.6]]), "ab")
+    selection = Spst().select(teacher, 0.5)
+    assert len({teacher, replace(teacher), selection, replace(selection)}) == 4
+    for one, name in ((teacher, "classes"), (selection, "theta")):
+        with pytest.raises(FrozenInstanceError):
+            setattr(one, name, 0)
+
+
 def of_counts(kept, n: int = 9) -> Selection:
     return Selection(np.ones(n, bool), 0.8, np.zeros(len(kept)), np.array(kept), np.array(kept))
 
@@ -166,7 +175,9 @@ def test_each_process_needs_two(processes):
 
 
 @pytest.mark.parametrize(
-    "returned", [np.array([0]), np.array([True]), np.array([0, 1])], ids=["index", "short", "int"]
+    "returned",
+    [np.array([0]), np.array([True]), np.array([True] * 3), np.array([0, 1]), np.array([0.0, 1.0])],
+    ids=["index", "short", "long", "int", "float"],
 )
 def test_positions_of_a_user_s_selector_are_not_taken_for_a_mask(returned):
     """Other samples than these would be trained on."""
@@ -183,5 +194,6 @@ def test_positions_of_a_user_s_selector_are_not_taken_for_a_mask(returned):
 
 @pytest.mark.parametrize("wrong", [{"mu": "two"}, {"order": "up"}, {"counts": "some"}])
 def test_wrong_settings_are_refused(wrong):
+    assert Spst() == Spst()
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Qbst(**wrong)

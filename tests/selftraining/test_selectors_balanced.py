@@ -185,6 +185,7 @@ def test_random_draws_each_sample_equally_often() -> None:
 
 
 def test_random_takes_its_defaults_and_says_whose_thresholds_it_has() -> None:
+    assert Random(Qbst()).needs_features is False
     table = [[0.9 - 0.01 * i, 0.1 + 0.01 * i] for i in range(30)]
     table += [row[::-1] for row in table]
     ids = [f"{i:02d}" for i in range(60)]
