@@ -13,7 +13,7 @@ THREADS ?=
 POINTS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor quickstart lint format test test-all test-triton bench mutants docs clean
+.PHONY: help install doctor quickstart lint format test test-all test-triton bench docs clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -62,9 +62,6 @@ test-all: install ## the slow tests too, shapes in signatures checked, and the b
 
 bench: install ## speed, as ratios against named baselines; of nets and methods on DEVICE=cuda; THREADS=1; POINTS=512 in methods' clouds
 	QS3_BENCH_DEVICE=$(DEVICE) QS3_BENCH_THREADS=$(THREADS) QS3_BENCH_POINTS=$(POINTS) $(RUN) -m pytest tests/benchmarks --benchmark-enable -s
-
-mutants: install ## how many faults put into the core the tests notice; hours, goes on where it stopped
-	$(RUN) .ci/mutants.py .ci/mutants.toml out/mutants.csv
 
 docs: install ## the docs as a site, in out/site
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict -f .ci/mkdocs.yml
