@@ -103,14 +103,14 @@ class Rules:
 
 
 class Fault(NamedTuple):
-    """One thing that is wrong with a piece, in a word or two and with its figure.
+    """What is wrong with a piece, in a word or two and with its figure; else a caution about it.
 
     A fault that `refuses` makes the piece useless, else it is hard.
     """
 
     kind: str
     words: str
-    refuses: bool
+    refuses: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,21 +185,10 @@ def cut(
 ) -> Piece:
     """Cut the object of a mask, of which some pixels may be wrong, and judge it.
 
-    Its class `cls` chooses the limits. So many pixels `edge_px` of the mask's edge are taken off;
-    None: `rules.erode_px`.
-    """
-    piece = cut_out(image, mask, rules, edge_px)
-    return replace(piece, faults=tuple(faults(piece, cls, rules)))
-
-
-def cut_out(
-    image: DepthImage, mask: Bool[np.ndarray, "h w"], rules: Rules, edge_px: int | None = None
-) -> Piece:
-    """What of a mask is the object, measured but not judged; without any depth it has no points.
-
-    The mask loses its edge, where labels and depth do not agree to the pixel. What is measured of
-    the rest is split where the depth jumps, and the largest piece stays with those that are near
-    it in space.
+    The mask loses `edge_px` pixels (None: `rules.erode_px`) of its edge, where labels and depth do
+    not agree to the pixel. What is measured of the rest is split where the depth jumps, and the
+    largest piece stays with those that are near it in space. `cls` chooses the limits. Without any
+    depth there are no points.
     """
     mask = mask & image.inside
     own, measured, core = own_pixels(image, mask, rules, edge_px)
@@ -211,17 +200,17 @@ def cut_out(
         points, inlier = points[inlier], inlier[inlier]
     holes = 1 - float(measured.sum()) / max(int(core.sum()), 1)
     piece = Piece(points.astype(np.float32), inlier, pixels, holes, own=taken)
-    if pixels == 0:
-        return piece
-    x, y, z = np.ptp(points[inlier], axis=0).tolist()
-    return replace(
-        piece,
-        kept=pixels / int(measured.sum()),
-        rim=rim(mask, image.inside, rules),
-        occ=occlusion(mask, own, image.depth_m, rules),
-        extent_m=(x, y, z),
-        depth_m=float(np.median(image.depth_m[own])),
-    )
+    if pixels:
+        x, y, z = np.ptp(points[inlier], axis=0).tolist()
+        piece = replace(
+            piece,
+            kept=pixels / int(measured.sum()),
+            rim=rim(mask, image.inside, rules),
+            occ=occlusion(mask, own, image.depth_m, rules),
+            extent_m=(x, y, z),
+            depth_m=float(np.median(image.depth_m[own])),
+        )
+    return replace(piece, faults=tuple(faults(piece, cls, rules)))
 
 
 def own_pixels(

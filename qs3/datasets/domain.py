@@ -101,13 +101,6 @@ class Domain:
         importer: Importer = build(self.published)
         return importer
 
-    def tell_of_judging(self, keys: str = "") -> None:
-        """Log if the test clouds are to be looked at once; `keys` stands before the domain's."""
-        importer = self.importer()
-        if importer is not None and (judges := importer.judges()):
-            text = "%s: this looks at what judges, %s; %spublished.fold=0 does not"
-            log.info(text, self.label, judges, keys)
-
     def check_scale(self, scale: str) -> None:
         """Raise ConfigError if a net cannot see the clouds at this scale (`data.scale`)."""
         lacks = "unit=metres" if scale != "unit_ball" and self.unit != "metres" else ""
@@ -135,9 +128,12 @@ class Domain:
                     "set published=null"
                 )
         elif not there:
-            places = [str(self.folder / "meta.yaml"), *([importer.looks_for()] if importer else [])]
+            looked = [self.folder / "meta.yaml"]
+            if importer:
+                looked += importer.files() or [importer.root / importer.holds]
+            places = " and ".join(map(str, looked))
             lines = {
-                f"domain {self.name}: {self.label} is not there. Looked for": " and ".join(places),
+                f"domain {self.name}: {self.label} is not there. Looked for": places,
                 "Where to get it": self.how_to_get.strip(),
                 "Make it": self.make,
                 "Or make a stand-in": self.stand_in,

@@ -30,10 +30,6 @@ BY_HAND: dict[str, dict[str, str]] = _FILE["by_hand"]
 """What has to be fetched by hand: whether it `asks` for an agreement, its `terms`, and `how`."""
 
 
-class DownloadError(Qs3Error):
-    """A file could not be fetched, or is not the one that was wanted."""
-
-
 class AgreementError(Qs3Error):
     """Terms have to be accepted first; the message says which and how."""
 
@@ -101,9 +97,7 @@ def provide(
 
     Nothing is fetched if all its folders are in place. An interruption at any moment leaves no
     half folder: the same call again starts over. For the arguments see `qs3.commands.download`.
-
-    Returns:
-        The folders, in the order of `source.parts`, also those that somebody else had put there.
+    Returns the folders in the order of `source.parts`.
     """
     if source.agreement and accept_terms != source.agreement:
         text, where = _FILE["agreements"][source.agreement], f" into={into}"
@@ -146,40 +140,32 @@ def fetch(source: Source, path: Path, mirror: str = "") -> Path:
     import requests
 
     url = f"{mirror.rstrip('/')}/{source.file}" if mirror else source.page
-    downloader = None if mirror or not source.drive else _from_drive(source.drive)
+
+    def from_drive(_url: str, output_file: str, _pooch: Any) -> None:
+        import gdown
+
+        try:
+            gdown.download(id=source.drive, output=output_file, quiet=not os.isatty(2))
+        except gdown.exceptions.DownloadError as error:
+            raise ValueError(f"Google Drive does not give it: {error}") from error
+
+    downloader = None if mirror or not source.drive else from_drive
     advice = f"open {source.page} in a browser and give the file with archive=PATH"
     try:
         pooch.retrieve(url, source.sha256, path.name, path.parent, downloader=downloader)
     except (requests.RequestException, ValueError) as error:  # ValueError: another hash
-        raise DownloadError(f"{url}: {error}. Run the same command again, or {advice}") from error
+        raise Qs3Error(f"{url}: {error}. Run the same command again, or {advice}") from error
     if source.size not in (None, path.stat().st_size):
         path.unlink()
-        raise DownloadError(f"{url} does not have {source.size} bytes; {advice}")
+        raise Qs3Error(f"{url} does not have {source.size} bytes; {advice}")
     return path
 
 
-def _from_drive(file_id: str) -> Any:
-    """A downloader for pooch that leaves a file on Google Drive to gdown."""
-
-    def download(url: str, output_file: str, pooch: Any) -> None:
-        import gdown
-
-        try:
-            gdown.download(id=file_id, output=output_file, quiet=not os.isatty(2))
-        except gdown.exceptions.DownloadError as error:
-            raise ValueError(f"Google Drive does not give it: {error}") from error
-
-    return download
-
-
 def unpack(archive: Path, into: Path) -> list[str]:
-    """Unpack a .zip, .tar, .tar.gz, .tar.bz2 or .tar.xz, whatever its name, into a new folder.
+    """Unpack a .zip or .tar, packed or not, into a new folder, and list its files.
 
     Nothing is written outside of the folder: zipfile drops what leads out of names, tarfile's
-    filter refuses it. Mac OS's companions (`__MACOSX`, `._name`) are removed.
-
-    Returns:
-        The files, relative to `into`, with slashes.
+    filter refuses it. Mac OS's companions (`__MACOSX`, `._name`) are not listed.
     """
     with reading(archive):
         if zipfile.is_zipfile(archive):

@@ -45,14 +45,9 @@ Part = tuple[dict[str, Any], dict[str, np.ndarray]]
 class FrameTask:
     """One frame, or one scene, to cut, before it is read.
 
-    Attributes:
-        name: of its part.
-        stem: of its objects' ids; "_" parts what is not independent of it from the rest.
-        split: "train" or "test".
-        number: in the dataset.
-        sensor: that took it.
-        vertical: how its vertical was found.
-        known: what the reader found out beforehand.
+    `name` is that of its part, `stem` that of its objects' ids, in which "_" parts what is not
+    independent of it from the rest. `vertical` is how its vertical was found, `known` what the
+    reader found out beforehand.
     """
 
     name: str
@@ -100,10 +95,7 @@ class CutDataset(Importer):
         return []
 
     def object_of(self, id_: str) -> str:
-        """See `Importer`: the room, or the block of frames.
-
-        It is what stands before the frame and the object's number in the last part of an id.
-        """
+        """See `Importer`: the room or block, before the frame's number and the object's."""
         return id_.rsplit("/", 1)[-1].rsplit("_", 2)[0]
 
     def watched(self) -> Iterable[Path]:

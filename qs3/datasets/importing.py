@@ -93,10 +93,6 @@ class Importer(abc.ABC):
         """The files that are read, all of which must be there."""
         return ()
 
-    def looks_for(self) -> str:
-        """What it reads, with the whole path, for a message."""
-        return " and ".join(map(str, self.files())) or f"{self.root}/{self.holds}"
-
     def is_there(self) -> bool:
         """Whether there is anything to read; must be fast."""
         files = self.files()
@@ -111,10 +107,6 @@ class Importer(abc.ABC):
     def made_of(self) -> MadeOf:
         """What the store is made of; goes into its meta.yaml."""
         return self.made
-
-    def judges(self) -> str:
-        """Which published clouds are for test and should be looked at once; "" of most datasets."""
-        return ""
 
     def object_of(self, id_: str) -> str:
         """Which object a cloud shows, where its id tells; else "".

@@ -23,8 +23,6 @@ from qs3.store.store import open_pointset
 from qs3.utils.settings import settings
 
 _FURTHER_SCAN = re.compile(r"~\d+$")
-DATASET = "dataset"
-"""The manifest's column that says which of them a cloud is of."""
 
 
 @settings
@@ -86,7 +84,7 @@ class Joined(Importer):
                     id=f"{object_}~{number}" if number else object_,
                     origin=f"{name}/{row.id}",
                     index=None,
-                    more={**row.more, DATASET: name},
+                    more={**row.more, "dataset": name},
                 )
                 # Without the repetitions by which a small cloud was filled up.
                 load = functools.partial(np.asarray, data.points[i][: row.valid_points])

@@ -26,13 +26,14 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from qs3.datasets.cutting import cut
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
@@ -55,7 +56,7 @@ AREA = (44, 471, 40, 601)
 _FARTHEST_M = 9.99
 
 
-class LabelledFrames:
+class LabelledFrames(AbstractContextManager["LabelledFrames"]):
     """The open .mat; a context manager. Images are read when they are asked for.
 
     Attributes:
@@ -76,9 +77,6 @@ class LabelledFrames:
                 self.scenes = self._words("scenes")
             assert len(self.scenes) == self._n
 
-    def __enter__(self) -> LabelledFrames:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
@@ -93,19 +91,11 @@ class LabelledFrames:
 
     def depth_m(self, frame: int) -> Float[np.ndarray, "h w"]:
         """[h, w] float64, 0 where nothing was measured (the toolbox cuts depths off at 10 m)."""
-        depth = self._read("rawDepths", frame).astype(np.float64)
+        depth = self.read("rawDepths", frame).astype(np.float64)
         return np.where(depth < _FARTHEST_M, depth, 0)
 
-    def labels(self, frame: int) -> Int[np.ndarray, "h w"]:
-        """[h, w] number of each pixel's name from 1; 0 for none."""
-        return self._read("labels", frame)
-
-    def instances(self, frame: int) -> Int[np.ndarray, "h w"]:
-        """[h, w] which thing of its name a pixel shows, from 1; 0 for none."""
-        return self._read("instances", frame)
-
-    def _read(self, key: str, frame: int) -> np.ndarray:
-        """One image, its axes put right."""
+    def read(self, key: str, frame: int) -> np.ndarray:
+        """[h, w] one image of the file; see the module."""
         with reading(self.path):
             found: np.ndarray = self._file[key][frame].T
             return found
@@ -158,7 +148,9 @@ class NYUv2(FrameDataset):
             chosen = [i for i, split in enumerate(splits) if split]
             for i in shown(chosen, "looking for floors"):
                 way, up = _vertical(frames, i)
-                room = _room(frames.scenes[i]) or f"block{i // self.block:04d}"
+                room = re.sub(r"[^\w-]", "-", frames.scenes[i])
+                room = re.sub(r"(?<=\d)[a-z]$", "", room)  # 0001d is a recording of 0001
+                room = room or f"block{i // self.block:04d}"
                 if up is None:
                     lost.append(i + 1)
                     continue
@@ -174,7 +166,7 @@ class NYUv2(FrameDataset):
         def cut_frame(task: FrameTask) -> list[tuple[ManifestRow, np.ndarray]]:
             index = task.number - 1
             image = DepthImage(frames.depth_m(index), CAMERA, task.known, frames.area)
-            labels, instances = frames.labels(index), frames.instances(index)
+            labels, instances = frames.read("labels", index), frames.read("instances", index)
             cuts = []
             for number in np.unique(labels[labels > 0]).tolist():
                 if number > len(frames.names):
@@ -212,12 +204,7 @@ def _vertical(frames: LabelledFrames, frame: int) -> tuple[str, np.ndarray | Non
     """How the vertical of a frame was found, and up in its camera."""
     depth_m, floor = frames.depth_m(frame), np.zeros(0, bool)
     if "floor" in frames.names:
-        floor = frames.labels(frame) == frames.names.index("floor") + 1
+        floor = frames.read("labels", frame) == frames.names.index("floor") + 1
     if floor.any() and (up := floor_up(depth_m, CAMERA, floor)) is not None:
         return "floor", up
     return "planes", planes_up(depth_m, CAMERA)
-
-
-def _room(scene: str) -> str:
-    """The room in a scene's name: bookstore_0001d is a recording of bookstore_0001."""
-    return re.sub(r"(?<=\d)[a-z]$", "", re.sub(r"[^\w-]", "-", scene))

@@ -57,8 +57,7 @@ class Archive:
         path: of the file.
         cls, sub, tier, dev: [N] text; `sub` is `cls` and `dev` empty where the file has none.
         frame: [N] number of the frame.
-        pixels, rim, occ: [N]; None where the file has none.
-        arrays: the points and where they begin.
+        arrays: all that the file holds.
     """
 
     path: Path
@@ -67,9 +66,6 @@ class Archive:
     tier: np.ndarray
     dev: np.ndarray
     frame: np.ndarray
-    pixels: np.ndarray | None
-    rim: np.ndarray | None
-    occ: np.ndarray | None
     arrays: Mapping[str, np.ndarray]
 
     def __len__(self) -> int:
@@ -123,12 +119,6 @@ class ObjectArchive(Importer):
     def made_of(self) -> MadeOf:
         """See `Importer`."""
         return MadeOf(objects=f"real objects cut from depth images, archive {self.path.name}")
-
-    def judges(self) -> str:
-        """See `Importer`."""
-        if self.fold is not None:
-            return ""
-        return f"part {JUDGE} of {self.path.name} (all of it, if it has no parts)"
 
     def files(self) -> list[Path]:
         """See `Importer`."""
@@ -200,7 +190,6 @@ def read_archive(path: Path) -> Archive:
         tier=found["tier"],
         dev=found.get("dev", np.full(n, "")),
         frame=found["img"].astype(np.int64),
-        **{key: found.get(key) for key in ("pixels", "rim", "occ")},
         arrays={**found, "start": start},
     )
 

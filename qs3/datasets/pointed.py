@@ -12,12 +12,12 @@ that do not go on outside the box, as floors and walls do.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.datasets.cutting import HARD, Piece, Rules, body, cut, pieces
+from qs3.datasets.cutting import HARD, Fault, Piece, Rules, body, cut, pieces
 from qs3.datasets.depth_images import CAMERA_UP, DepthImage, Pinhole, checked_mask, upright
 from qs3.datasets.vertical import angle_deg, planes_up_steep
 from qs3.errors import DataError
@@ -48,13 +48,6 @@ _TRIM = 3.0  # median absolute deviations
 _STEEPEST = np.cos(np.deg2rad(20.0))  # of a support
 
 
-class Caution(NamedTuple):
-    """Why a prediction may be wrong, though it was made: in a word or two, and with the figure."""
-
-    kind: str
-    words: str
-
-
 @dataclass(frozen=True, eq=False)
 class Pointed:
     """One object.
@@ -77,7 +70,7 @@ class Pointed:
     mask: Bool[np.ndarray, "h w"]
     without_depth: int
     tier: str
-    cautions: tuple[Caution, ...]
+    cautions: tuple[Fault, ...]
     up: str
     world_from_camera: Float[np.ndarray, "3 3"]
     why: str = ""
@@ -134,7 +127,7 @@ def _judged(
     mask: Bool[np.ndarray, "h w"],
     edge_px: int,
     how: str,
-    unsure: Sequence[Caution],
+    unsure: Sequence[Fault],
 ) -> Pointed:
     piece = cut(image, mask, "", RULES, edge_px)
     if not piece.pixels and edge_px:  # so thin that nothing else is there
@@ -147,13 +140,13 @@ def _judged(
         return Pointed(name, piece, mask, without, POOR, (), how, turn, why)
     boxed = any(caution.kind == BOX for caution in unsure)
     tier = POOR if piece.refused else HARD if boxed else piece.tier
-    cautions = (*(Caution(fault.kind, fault.words) for fault in piece.faults), *unsure)
+    cautions = (*piece.faults, *unsure)
     return Pointed(name, piece, mask, without, tier, cautions, how, turn)
 
 
 def _vertical(
     image: DepthImage, up: Sequence[float] | None
-) -> tuple[np.ndarray, str, tuple[Caution, ...]]:
+) -> tuple[np.ndarray, str, tuple[Fault, ...]]:
     """Up in camera coordinates, how it is known, and what is not sure about it."""
     fitted, sure = planes_up_steep(image.depth_m, image.camera)
     words = ""
@@ -178,7 +171,7 @@ def _vertical(
     else:
         way, how = CAMERA_UP, LEVEL
         words = "up is not known: the picture shows no planes, so the camera counts as level"
-    return way, how, (Caution("up", words),) if words else ()
+    return way, how, (Fault("up", words),) if words else ()
 
 
 def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, int]:
@@ -196,7 +189,7 @@ def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, i
 
 def in_box(
     image: DepthImage, sides: tuple[int, int, int, int]
-) -> tuple[Bool[np.ndarray, "h w"], tuple[Caution, ...]]:
+) -> tuple[Bool[np.ndarray, "h w"], tuple[Fault, ...]]:
     """The pixels of a box's object, and cautions.
 
     What the object stands on is the plane, within 20° of level, that most points next to and below
@@ -225,7 +218,7 @@ def in_box(
     result = np.zeros_like(inner)
     if not (left_over & inside).any():
         result[at] = inside & measured
-        return result, (Caution(BOX, "all in the box is the plane that things stand on"),)
+        return result, (Fault(BOX, "all in the box is the plane that things stand on"),)
     number = pieces(left_over, depth, RULES)
     everywhere = np.bincount(number[left_over])
     within = np.bincount(number[inside & left_over], minlength=len(everywhere))
@@ -233,7 +226,7 @@ def in_box(
     if (within * own).max() < max(0.05 * within.max(), _LEAST_PX):
         result[at] = inside & left_over
         words = "what lies in the box goes on outside of it; a mask tells more than a box"
-        return result, (Caution(BOX, words),)
+        return result, (Fault(BOX, words),)
     number = np.where(inside & np.isin(number, np.flatnonzero(own)), number, -1)
     fits = (within * own).astype(np.float64)
     for k in np.flatnonzero(fits):

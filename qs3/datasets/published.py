@@ -11,7 +11,6 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge
-from jaxtyping import Float, Int
 
 from qs3.classes import known_as
 from qs3.datasets.clouds import parse_cloud, read_arrays
@@ -77,10 +76,7 @@ class PublishedTree(Importer):
         return cloud if cls in self.up_z_classes else super().turn(cloud, cls)
 
     def object_of(self, id_: str) -> str:
-        """See `Importer`: the room, of ScanNet's ids such as "chair/test/scene0011_01_7".
-
-        Rooms were scanned up to a dozen times (_00, _01, ...), with the same objects in them.
-        """
+        """See `Importer`: the room, scanned up to a dozen times, of "chair/test/scene0011_01_7"."""
         room = _SCANNET.search(id_)
         return room[1] if room else ""
 
@@ -228,7 +224,7 @@ class PointDAH5(ArrayFiles):
 
     def clouds(self, path: Path, split: str, classes: Sequence[str]) -> Iterator[Cloud]:
         """See `ArrayFiles`."""
-        return _of_h5(path, split, classes, digits=4)
+        return read_h5(path, split, classes, digits=4)
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
@@ -261,7 +257,7 @@ class ScanObjectNN(ArrayFiles):
 
     def clouds(self, path: Path, split: str, classes: Sequence[str]) -> Iterator[Cloud]:
         """See `ArrayFiles`."""
-        return _of_h5(path, split, SCANOBJECTNN, digits=5)
+        return read_h5(path, split, SCANOBJECTNN, digits=5)
 
 
 def named_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -271,15 +267,6 @@ def named_arrays(path: Path) -> dict[str, np.ndarray]:
         assert len({*map(len, arrays.values())}) == 1, "its arrays have different lengths"
         assert arrays["points"].shape[2:] == (3,), f"points of shape {arrays['points'].shape}"
     return arrays
-
-
-def read_h5(path: Path) -> tuple[Float[np.ndarray, "n P 3"], Int[np.ndarray, " n"]]:
-    """Positions, float32, and labels of one file, axes as stored; DataError if damaged."""
-    import h5py
-
-    with reading(path), h5py.File(path, "r") as file:
-        points = np.asarray(file["data"][..., :3], dtype=np.float32)
-        return points, np.asarray(file["label"][...], dtype=np.int64).reshape(-1)
 
 
 def sample_file(path: Path, points: int, seed: int) -> np.ndarray:
@@ -306,10 +293,13 @@ def _tree(
             yield path, cls, split_of(split.name, split)
 
 
-def _of_h5(path: Path, split: str, names: Sequence[str], digits: int) -> Iterator[Cloud]:
-    """The clouds of one file; `names` of the classes by label."""
-    data, labels = read_h5(path)
-    with reading(path):
+def read_h5(path: Path, split: str, names: Sequence[str], digits: int) -> Iterator[Cloud]:
+    """The clouds of one file, float32, axes as stored; `names` of the classes by label."""
+    import h5py
+
+    with reading(path), h5py.File(path, "r") as file:
+        data = np.asarray(file["data"][..., :3], dtype=np.float32)
+        labels = np.asarray(file["label"][...], dtype=np.int64).reshape(-1)
         assert len(labels) == len(data), f"{len(data)} clouds and {len(labels)} labels"
         assert ((labels >= 0) & (labels < len(names))).all(), f"labels not 0..{len(names) - 1}"
     for number, (cloud, label) in enumerate(zip(data, labels.tolist(), strict=True)):

@@ -1,13 +1,12 @@
 """Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
 
-    from qs3.datasets.pyg import from_pyg, knn_graph, to_pyg
+    from qs3.datasets.pyg import from_pyg, to_pyg
 
     train = to_pyg("specklenet10", "train", transform=FixedPoints(1024))  # a domain of conf/domain
     loader = DataLoader(train, batch_size=32, shuffle=True)               # PyG's own
     from_pyg({"train": mine, "test": my_test}, "data/mine", classes=["box", "cup"])
 
-PyG is imported here and nowhere else in qs3.datasets: import this module when you want it. Its own
-neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges from ours.
+PyG is imported here and nowhere else in qs3.datasets: import this module when you want it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,13 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch_geometric.data import Data, Dataset, InMemoryDataset
 
 from qs3.classes import class_list
 from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError, DataError
-from qs3.geometry.neighbours import knn
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.store.meta import MadeOf, ManifestRow, is_begun, is_finished
 from qs3.store.store import PointSet, write_pointset
@@ -81,7 +78,6 @@ def from_pyg(
         datasets: by split ("train", "validation", "test"). Each cloud has `pos` [n, 3], and all or
             none of them a `y` of one whole number. Its `id` names it, if it is text; else its class
             and position.
-        folder: of the new dataset.
         classes: names in the order of `y`, or "modelnet40"; None: `classes` of the first dataset,
             if it has any; without labels the benchmark's ten.
         points: of a cloud; larger ones are thinned to their farthest points, from the first on.
@@ -137,43 +133,3 @@ def _classes(
             f"classes={found}: expected a name for each y, {min(known)} to {max(known)}"
         )
     return found
-
-
-def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) -> Tensor:
-    """Edges from the k nearest neighbours of each point to it, as PyG's `knn_graph` has them.
-
-    Clouds of one size take one search a batch; others one a cloud.
-
-    Args:
-        x: [n, c] positions or features of all clouds of a batch, on any device.
-        batch: [n] int64, sorted: which cloud each point belongs to; None: one cloud.
-        k: neighbours of a point; a cloud of fewer has edges to all that there are.
-        loop: whether a point is a neighbour of itself.
-
-    Returns:
-        [2, edges] int64: neighbours (sources) in the first row, points (targets) in the second,
-        points in order, and the neighbours of each from the nearest on.
-    """
-    if batch is None:
-        batch = x.new_zeros(len(x), dtype=torch.int64)
-    elif (batch.diff() < 0).any():
-        raise ValueError("batch is not sorted: the points of each cloud must be together")
-    sizes = batch.unique_consecutive(return_counts=True)[1].tolist()
-    starts = np.cumsum([0, *sizes]).tolist()
-    clouds = [x.view(len(sizes), sizes[0], -1)] if len(set(sizes)) == 1 else x[None].split(sizes, 1)
-    parts = [_edges(cloud, k, loop) + start for start, cloud in zip(starts, clouds, strict=False)]
-    return torch.cat([x.new_empty((2, 0), dtype=torch.int64), *parts], dim=1)
-
-
-def _edges(x: Tensor, k: int, loop: bool) -> Tensor:
-    """[2, edges] of clouds of one size, [b, n, c]."""
-    b, n, _ = x.shape
-    own = torch.arange(n, device=x.device)[None, :, None]
-    index = knn(x, min(k + (not loop), n))
-    if not loop:  # of copies of a point, another one may be found first, and itself not at all
-        other = index != own
-        other[..., -1] &= ~other.all(-1)
-        index = index[other].view(b, n, -1)
-    index = index + (torch.arange(b, device=x.device) * n)[:, None, None]
-    target = torch.arange(b * n, device=x.device).view(b, n, 1).expand_as(index)
-    return torch.stack([index.flatten(), target.flatten()])

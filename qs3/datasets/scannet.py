@@ -37,6 +37,7 @@ from qs3.datasets.scannet_files import (
     MaskArchive,
     SensFile,
     SensHeader,
+    is_rigid,
     read_label_map,
     read_objects,
     read_scene_list,
@@ -125,7 +126,7 @@ def _extract(
             labels=stack.enter_context(MaskArchive(labels, LABELS)),
         )
         every = range(0, scan.sens.header.frames, data.stride)
-        frames = [f for f in every if scan.sens.has_pose(f) and f in scan.instances.frames]
+        frames = [f for f in every if is_rigid(scan.sens.poses[f]) and f in scan.instances.frames]
         if not frames:
             raise DataError(f"{sens}: no frame has a finite pose and a mask")
         sightings = _first_pass(scan, frames, labelled, data.min_points)
@@ -206,8 +207,7 @@ class Registration:
     def _visible(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> Bool[np.ndarray, " n"]:
         """Whether nothing clearly nearer lies in the point's cell or one next to it.
 
-        The cells next to it stand for sides of a nearer thing that only the colour camera sees:
-        no depth was measured there.
+        Those next to it stand for sides, without depth, that only the colour camera sees.
         """
         height, width = self._mask_shape
         col = ((u + 0.5) / self._cell_px).astype(np.int64)
@@ -319,10 +319,9 @@ def _second_pass(
     label_map: LabelMap,
     min_points: int,
 ) -> dict[Labelled, dict[int, np.ndarray]]:
-    """The crops of the chosen frames whose label masks do not deny the class.
+    """The pixels of chosen frames to which the label mask gives the object's class.
 
-    A pixel counts if the label mask gives it the object's class; a frame counts if more than
-    `min_points` of its pixels and more than half of them do.
+    A frame counts if these are more than `min_points` and more than half of its pixels.
     """
     crops: dict[Labelled, dict[int, np.ndarray]] = {one: {} for one in chosen}
     of_frame: dict[int, list[Labelled]] = defaultdict(list)

@@ -39,7 +39,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -96,7 +96,7 @@ class SensHeader:
     frames: int
 
 
-class SensFile:
+class SensFile(AbstractContextManager["SensFile"]):
     """An open recording; a context manager. DataError if it is not a recording or broken off.
 
     Opening it reads the header and, skipping the images, every frame's pose; images are read when
@@ -104,7 +104,7 @@ class SensFile:
 
     Attributes:
         header: what holds for all frames.
-        poses: [frames, 4, 4] float64 world_from_depth as stored; see `has_pose`.
+        poses: [frames, 4, 4] float64 world_from_depth as stored; a lost frame's is not rigid.
     """
 
     def __init__(self, path: Path) -> None:
@@ -122,15 +122,8 @@ class SensFile:
             assert self._file.tell() <= path.stat().st_size, "it is broken off; download it again"
             stack.pop_all()  # closed by __exit__
 
-    def __enter__(self) -> SensFile:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._file.close()
-
-    def has_pose(self, frame: int) -> bool:
-        """Whether the frame's pose is finite and a rigid motion."""
-        return is_rigid(self.poses[frame])
 
     def depth_m(self, frame: int) -> Float[np.ndarray, "h w"]:
         """[h, w] float32 depth along the optical axis in metres, 0 where nothing was measured."""
@@ -179,7 +172,7 @@ def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
     return bool(near and last_row and np.linalg.det(rotation) > 0)
 
 
-class MaskArchive:
+class MaskArchive(AbstractContextManager["MaskArchive"]):
     """An open zip of masks, of the folder `INSTANCES` or `LABELS`; a context manager.
 
     Attributes:
@@ -195,9 +188,6 @@ class MaskArchive:
             self._members = {int(match[1]): name for match, name in named if match}
             assert self._members, f"it has no {folder}/<frame>.png"
         self.frames = frozenset(self._members)
-
-    def __enter__(self) -> MaskArchive:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._zip.close()

@@ -41,7 +41,6 @@ from qs3.utils.settings import settings
 META = "SUNRGBDMeta3DBB_v2.mat"
 SPLITS = "SUNRGBDtoolbox/traintestSUNRGBD/allsplit.mat"
 Sensor = Literal["kv1", "kv2", "xtion", "realsense"]
-SENSORS: tuple[Sensor, ...] = get_args(Sensor)
 
 _ROOT = "SUNRGBD"
 _SUN3D = "sun3ddata"  # its folders are rooms; those of the other parts are single frames
@@ -82,15 +81,6 @@ def read_splits(root: Path, splits: str = SPLITS) -> dict[PurePosixPath, str]:
         return {_inner(words): split for name, split in sides for words in _listed(found[name])}
 
 
-def open_image(root: Path, frame: Frame) -> DepthImage:
-    """The raw depth of a frame; DataError if it is not there, damaged, or more than one."""
-    folder = root / Path(*frame.folder.parts) / "depth"
-    with reading(folder):
-        (path,) = folder.glob("*.png")
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        return DepthImage(millimetres(pixels) / 1000.0, frame.camera, frame.world_from_camera)
-
-
 def millimetres(rotated: np.ndarray) -> Float[np.ndarray, "h w"]:
     """[h, w] float64 depth in millimetres from pixels of 16 bits that were rotated."""
     assert np.asarray(rotated).dtype == np.uint16, "not a picture of 16 bits"
@@ -101,7 +91,7 @@ def millimetres(rotated: np.ndarray) -> Float[np.ndarray, "h w"]:
 class SUNRGBD(FrameDataset):
     """See the module; conf/domain/sunrgbd.yaml explains its settings."""
 
-    sensors: list[Sensor] = field(default_factory=lambda: list(SENSORS))
+    sensors: list[Sensor] = field(default_factory=lambda: list(get_args(Sensor)))
     splits: str = SPLITS
 
     made: ClassVar[MadeOf] = MadeOf(
@@ -129,7 +119,11 @@ class SUNRGBD(FrameDataset):
             wanted = [(name, box) for name, box in frame.boxes if name in self.names]
             if not wanted:
                 return []
-            image = open_image(self.root, frame)
+            folder = self.root / Path(*frame.folder.parts) / "depth"
+            with reading(folder):
+                (path,) = folder.glob("*.png")
+                depth_mm = millimetres(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            image = DepthImage(depth_mm / 1000.0, frame.camera, frame.world_from_camera)
             cuts = []
             for number, (name, box) in enumerate(wanted, start=1):
                 if box is None:

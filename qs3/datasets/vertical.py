@@ -106,10 +106,7 @@ def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:
 
 
 def _without_lone_holes(depth_m: np.ndarray) -> np.ndarray:
-    """Pixels without depth as the mean of those around them, where most of the eight have one.
-
-    Depth cameras leave such holes all over a picture, and one in a window would take its normal.
-    """
+    """Pixels without depth as the mean of those around them, where most of the eight have one."""
     measured = (depth_m > 0).astype(np.float64)
     nine = np.ones(3)
     count = cv2.sepFilter2D(measured, cv2.CV_64F, nine, nine, borderType=cv2.BORDER_CONSTANT)

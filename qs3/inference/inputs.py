@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
 from qs3.datasets.clouds import SUFFIXES, CloudFile, parse_clouds, with_depth
-from qs3.datasets.cutting import Piece, faults
+from qs3.datasets.cutting import Fault, Piece, faults
 from qs3.datasets.depth_images import (
     Intrinsics,
     check_intrinsics,
@@ -29,7 +29,7 @@ from qs3.datasets.depth_images import (
 )
 from qs3.datasets.importing import UP_AXES, turned
 from qs3.datasets.object_archive import ADAPT, JUDGE, Archive, is_archive, read_archive
-from qs3.datasets.pointed import RULES, Caution, point_out
+from qs3.datasets.pointed import RULES, point_out
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
@@ -74,7 +74,7 @@ class Sample:
     axis: str = "z"
     label: str = ""
     tier: str = ""
-    cautions: tuple[Caution, ...] = ()
+    cautions: tuple[Fault, ...] = ()
     up: str = ""
     picture: tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]] | None = None
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
@@ -206,13 +206,13 @@ def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sa
     cloud = archive.cloud(index)
     tier, cautions = str(archive.tier[index]), []
     if tier == "hard":
-        known = (archive.pixels, archive.rim, archive.occ)
+        known = (archive.arrays.get(key) for key in ("pixels", "rim", "occ"))
         pixels, rim, occ = (0.0 if one is None else float(one[index]) for one in known)
         extent: Any = tuple(np.ptp(cloud, axis=0).tolist())
         inlier, seen = np.ones(len(cloud), dtype=bool), int(pixels) or len(cloud)
         piece = Piece(cloud, inlier, seen, holes=0.0, rim=rim, occ=occ, extent_m=extent)
-        cautions = [Caution(one.kind, one.words) for one in faults(piece, "", RULES)]
-        cautions = cautions or [Caution("otherwise hard", "the archive calls it hard")]
+        cautions = faults(piece, "", RULES)
+        cautions = cautions or [Fault("otherwise hard", "the archive calls it hard")]
     yield Sample(
         f"{archive.path.name}[{index}]",
         cloud,
@@ -278,9 +278,9 @@ def pointed(
     """The objects of a mask, one a number, or of a box; see `qs3.datasets.pointed.point_out`."""
     doubt = check_intrinsics(given, depth_m, name or "the depth image")
     found = point_out(depth_m, given.camera, mask=mask, box=box, up=up)
-    unsure = [Caution("camera", doubt)] if doubt else []
+    unsure = [Fault("camera", doubt)] if doubt else []
     if given.bent:
-        unsure.append(Caution("lens", "the camera's distortion is known and not corrected"))
+        unsure.append(Fault("lens", "the camera's distortion is known and not corrected"))
     for one in found:
         sample = Sample(
             name + one.name,

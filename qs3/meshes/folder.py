@@ -30,10 +30,9 @@ from qs3.meshes.mesh import MeshItem
 from qs3.utils.settings import settings
 
 SPLITS = ("train", "test")
-SPLIT_FOLDERS = {
-    **{"": "", "train": "train", "test": "test"},
-    **dict.fromkeys(("val", "valid", "validation"), "train"),
-}
+SPLIT_FOLDERS = {"": "", "test": "test"} | dict.fromkeys(
+    ("train", "val", "valid", "validation"), "train"
+)
 """Split by the folder's name; "" of files right in the folder of their class."""
 LAYOUTS = "expected class/train/name.off with class/test/name.off, or class/name.off"
 

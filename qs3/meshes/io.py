@@ -49,8 +49,7 @@ def is_mesh(path: Path) -> bool:
 def load_mesh(path: str | Path, keep_colliders: bool = False, up: Up = "z") -> Mesh:
     """Read a mesh; polygons are cut into triangles, the parts of a scene are put together.
 
-    Duplicate faces and faces of either orientation are accepted, and vertices are not merged;
-    those that no face uses are left out.
+    Vertices are not merged; those that no face uses are left out.
 
     Args:
         path: of a file with one of `SUFFIXES`, in any case.

@@ -110,9 +110,8 @@ def merge(meshes: list[Mesh]) -> Mesh:
 def without_strays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same without vertices that no face uses; the same arrays where there are none.
 
-    Modelling programs leave some behind. They are not seen, but furniture is as large, and shadow
-    rays begin as far away, as all vertices tell. Of a damaged file, where one is not finite, none
-    is left out: `Mesh` raises.
+    They are not seen, but would count for an object's size. Of a damaged file, where one is not
+    finite, none is left out: `Mesh` raises.
     """
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
@@ -128,8 +127,6 @@ class MeshItem:
 
     Attributes:
         id: unique in its source, e.g. "chair/train/chair_0007"; decides the object's seed.
-        cls: class name.
-        split: "train" or "test".
         load: makes or reads the mesh; raises MeshError with the reason. Picklable.
         origin: what the user would look for: a file name or a family of the catalogue.
         path: the file it is read from; None if it is made.
@@ -154,22 +151,15 @@ _COLLIDER = re.compile(
 def is_collider(*names: str | None) -> bool:
     """Whether a node of a scene with one of these names stands for collisions, and is not seen.
 
-    A game engine's invisible hulls come along in its exports. Scanned as if they were furniture,
-    they fill the legs of a chair. Known by the name of the node or of its mesh, in any case:
-
-    - `chair_collider`, `chair_collision`, also with a number behind: what exporters write;
-    - UCX_, UBX_, UCP_, USP_ and MCDCX_ before the name: Unreal Engine's static mesh pipeline;
-    - `-colonly` and `-convcolonly` behind it: Godot (its `-col` keeps the mesh visible).
+    Exporters write `chair_collider` or `chair_collision`, Unreal Engine's static mesh pipeline
+    UCX_, UBX_, UCP_, USP_ or MCDCX_ before the name, and Godot `-colonly` or `-convcolonly` behind
+    it (its `-col` keeps the mesh visible).
     """
     return any(_COLLIDER.search(str(name)) for name in names if name)
 
 
 def _collider_nodes(scene: trimesh.Scene) -> tuple[set[Hashable], int]:
-    """Nodes whose geometry is left out, colliders and all below them; and how many colliders.
-
-    A node below a collider is not counted again; a mesh with such a name hides the node's own
-    geometry only.
-    """
+    """Colliders with all below them, or only a node's geometry if that has the name; how many."""
     forest, hidden, count = scene.graph.transforms, set(), 0
     waiting = [node for node in forest.nodes if node not in forest.parents]
     while waiting:

@@ -17,7 +17,6 @@ class Placing(Protocol):
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str) -> Mesh:
         """A scaled, moved and turned copy; `object_id` for those who look it up in a list."""
-        ...
 
 
 @settings
@@ -32,7 +31,7 @@ class UnitCube:
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A scaled, centred and turned copy."""
-        yaw_rad = _yaw_rad(rng)  # drawn in any case: what else is drawn does not depend on it
+        yaw_rad = rng.uniform(0, 2 * np.pi)  # in any case: other draws do not depend on `yaw`
         return _place(mesh, 1 / largest_side(mesh), False, yaw_rad if self.yaw else 0.0)
 
 
@@ -55,7 +54,7 @@ class RealSize:
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A turned copy on the floor."""
         scale = 1.0 if self.keeps(mesh) else self.fallback_side_m / largest_side(mesh)
-        return _place(mesh, scale, True, _yaw_rad(rng))
+        return _place(mesh, scale, True, rng.uniform(0, 2 * np.pi))
 
 
 @settings
@@ -93,10 +92,6 @@ def largest_side(mesh: Mesh) -> float:
     if side <= 0:
         raise MeshError("the mesh has no extent: all its vertices are one point")
     return side
-
-
-def _yaw_rad(rng: np.random.Generator) -> float:
-    return rng.uniform(0, 2 * np.pi)
 
 
 def _place(mesh: Mesh, scale: float, on_floor: bool, yaw_rad: float) -> Mesh:

@@ -88,14 +88,7 @@ def triangulated(vertices: np.ndarray, sizes: np.ndarray, corners: np.ndarray) -
 def _wrongly_fanned(
     vertices: np.ndarray, faces: np.ndarray, starts: np.ndarray, counts: np.ndarray
 ) -> list[int]:
-    """Which polygons have a triangle that is turned over.
-
-    Args:
-        vertices: [V, 3].
-        faces: [F, 3] the fans.
-        starts: [N] the first triangle of each polygon.
-        counts: [N] its number of triangles, two or more.
-    """
+    """Which of N polygons, by first triangle and number of them, have one that is turned over."""
     if not len(starts):
         return []
     within = np.cumsum(counts) - counts

@@ -151,7 +151,8 @@ def read_ply(data: bytes) -> Triangles:
     vertices = polygons = None
     for element, columns in _elements(data):
         if element.name == "vertex":
-            vertices = _vertices(columns)
+            names = [axis if axis in columns else axis.upper() for axis in "xyz"]
+            vertices = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
         elif element.name == "face":
             key = "vertex_indices" if "vertex_indices" in columns else "vertex_index"
             sizes, corners = columns[key]
@@ -159,11 +160,6 @@ def read_ply(data: bytes) -> Triangles:
         if vertices is not None and polygons is not None:
             return vertices, triangulated(vertices, *polygons)
     raise MeshError("has no faces: it is a point cloud, or not made of triangles")
-
-
-def _vertices(columns: dict[str, Any]) -> np.ndarray:
-    names = [axis if axis in columns else axis.upper() for axis in "xyz"]
-    return np.stack([columns[name] for name in names], axis=1).astype(np.float64)
 
 
 def _elements(data: bytes) -> Iterator[tuple[_Element, dict[str, Any]]]:
@@ -206,10 +202,7 @@ def _parsed(data: bytes) -> tuple[list[_Element], bytes]:
 
 
 def _uniform(element: _Element, body: bytes, offset: int) -> tuple[dict[str, Any], int] | None:
-    """An element in one piece, and the offset behind it: all lists are as long as in the first row.
-
-    None where they are not, or the file ends before.
-    """
+    """An element all of whose lists are as long as in the first row, and the offset behind it."""
     fields: list[tuple[Any, ...]] = []
     sizes: dict[int, int] = {}  # of the lists in the first row
     place = offset

@@ -50,7 +50,6 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
     """
     if not is_finished(name) and (name in choices("domain") or not Path(name).exists()):
         domain = compose_domain(name, overrides)
-        domain.tell_of_judging()
         return opened_domain(domain, domain.open())
     if unknown := sorted({*overrides} - {"variant", "paths.data_dir"}):
         raise ConfigError(f"{', '.join(unknown)}: a dataset's folder takes variant= alone")

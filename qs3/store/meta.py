@@ -10,6 +10,7 @@ import csv
 import dataclasses
 import hashlib
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -147,7 +148,7 @@ class ManifestRow:
             number of rows in its file (fewer than P: the rest repeats them).
         status: "ok", or a word for what went wrong ("failed", "skipped").
         reason: why it is not ok; of one that is, what was left out of its file, if anything.
-        index: row of the arrays; set by `write_pointset`, None if not ok.
+        index: row of the arrays; None if not ok.
         more: further columns of this dataset alone, by header: sensor, tier, frame. A manifest
             has them only if a row does, so others keep their bytes.
     """
@@ -194,12 +195,10 @@ def read_manifest(
 
 def number(rows: Sequence[ManifestRow]) -> list[ManifestRow]:
     """The rows with `index` counted up over those with status ok."""
-    numbered, index = [], 0
-    for row in rows:
-        ok = row.status == OK
-        numbered.append(dataclasses.replace(row, index=index if ok else None))
-        index += ok
-    return numbered
+    indices = itertools.count()
+    return [
+        dataclasses.replace(row, index=next(indices) if row.status == OK else None) for row in rows
+    ]
 
 
 def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str) -> None:

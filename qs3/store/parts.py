@@ -184,9 +184,4 @@ def _differences(old: Any, new: Any, key: str = "") -> list[str]:
     if isinstance(old, list) and isinstance(new, list) and len(str(old)) > 80:
         other = sorted(map(str, {*map(str, old)} ^ {*map(str, new)}))
         return [f"  {key}: {len(old)} there, {len(new)} now, such as {' '.join(other[:1])}"]
-    return [f"  {key}: {_short(old)} there, {_short(new)} now"]
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+    return [f"  {key}: {json.dumps(old):.80} there, {json.dumps(new):.80} now"]

@@ -15,8 +15,6 @@ clouds give the same bytes.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -43,7 +41,14 @@ from qs3.store.meta import (
     write_meta,
 )
 from qs3.utils import text_table
-from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
+from qs3.utils.files import (
+    atomic_path,
+    make_folder,
+    reading,
+    remove_leftovers,
+    sha256_file,
+    write_text,
+)
 from qs3.utils.version import VERSION
 
 _CHUNK_CLOUDS = 512  # that are in memory at a time
@@ -170,8 +175,6 @@ def write_pointset(
 
     Args:
         folder: created if need be; other files in it are left alone.
-        name: of the dataset.
-        classes: names in label order.
         arrays: by file stem; "points" is required. Each is [N, P, 3] or N arrays of [P, 3];
             stored as float32. A sequence that reads its clouds when asked keeps memory small: it
             is asked twice for each, to check and to write.
@@ -224,11 +227,8 @@ def write_pointset(
 def open_pointset(folder: str | Path, variant: str = "points", verify: bool = True) -> PointSet:
     """Open a dataset, checking all that can be checked in about a second.
 
-    Args:
-        folder: of the dataset.
-        variant: which array, by file stem.
-        verify: also compare the array's SHA-256 with meta.yaml (about 1 s for 500 MB); the
-            manifest's is always compared.
+    `variant` is the file stem of the array. With `verify` its SHA-256 is compared, too (about 1 s
+    for 500 MB); the manifest's always is.
 
     Raises:
         MissingDataError: there is no such folder, or it was not finished.
@@ -283,42 +283,25 @@ def _chunks(clouds: Clouds, where: str) -> Iterator[np.ndarray]:
 
 def _write_array(path: Path, clouds: Clouds) -> str:
     """Write an array, atomically; returns its file's SHA-256."""
-    head = _header(_shape(clouds))
-    whole = hashlib.sha256(head)
+    header = {"descr": "<f4", "fortran_order": False, "shape": _shape(clouds)}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(head)
+        np.lib.format.write_array_header_1_0(file, header)
         for chunk in _chunks(clouds, str(path)):
             file.write(chunk.data.cast("B"))
-            whole.update(chunk.data)
-    return whole.hexdigest()
+    return sha256_file(path)
 
 
 def _open_array(folder: Path, key: str, meta: Mapping[str, Any], verify: bool) -> np.ndarray:
-    """[N, P, 3] float32 memmap whose header, size and hash are what they were."""
+    """[N, P, 3] float32 memmap whose layout, size and hash are what they were."""
     path, shape = folder / f"{key}.npy", (meta["clouds"], meta["points"], 3)
-    head = _header(shape)
-    size = len(head) + 4 * shape[0] * shape[1] * shape[2]
-    try:
-        with open(path, "rb") as file:
-            fits = file.read(len(head)) == head and path.stat().st_size == size
-        same = fits and (not verify or sha256_file(path) == meta["sha256"][key])
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
-    if not same:
-        raise DataError(
-            f"{path} is damaged: it is not the float32 array {list(shape)} with the SHA-256 in "
-            f"meta.yaml; {AGAIN}"
-        )
-    return np.memmap(path, dtype="<f4", mode="r", offset=len(head), shape=shape)
-
-
-def _header(shape: tuple[int, ...]) -> bytes:
-    """The .npy header of a float32 C-order array: the only one this format has."""
-    file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        file, {"descr": "<f4", "fortran_order": False, "shape": shape}
-    )
-    return file.getvalue()
+    with reading(path):
+        array = np.lib.format.open_memmap(path, mode="r")
+        size = array.offset + array.nbytes
+        found = array.shape, array.dtype, array.flags.c_contiguous, size
+        assert found == (shape, np.dtype("<f4"), True, path.stat().st_size), AGAIN
+        if verify:
+            assert sha256_file(path) == meta["sha256"][key], f"another SHA-256; {AGAIN}"
+    return array
 
 
 def _first_bad(clouds: np.ndarray) -> int | None:

@@ -36,7 +36,6 @@ def train(cfg: DictConfig) -> RunMetrics:
         # What `force` begins anew stays until its data are open (`note_start`).
         metrics = None if cfg.force else read_metrics(run.folder)
         if metrics is None:
-            run.target.tell_of_judging("data.target.")
             with _wandb_forgotten():
                 metrics = _fit(run)
                 write_metrics(run.folder, metrics)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from qs3.classes import CLASSES
 from qs3.datasets.clouds import parse_clouds
 from qs3.datasets.depth_images import read_depth, read_intrinsics, read_mask
 from qs3.datasets.frames import load_mat
@@ -97,7 +98,7 @@ FORMATS: dict[str, tuple[str, Callable, Callable]] = {
     "pointda": (
         "train_0.h5",
         lambda p: published.write_pointda_h5(p.parent, ONE, points=16, files=1),
-        read_h5,
+        lambda p: list(read_h5(p, "train", CLASSES, 4)),
     ),
     "named arrays": ("a.npz", lambda p: published.write_named_arrays(p, ONE), named_arrays),
     "archive": ("a.npz", lambda p: frame_files.write_archive(p, ONE), read_archive),

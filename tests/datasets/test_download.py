@@ -18,13 +18,12 @@ from qs3.datasets.download import (
     MARK,
     SOURCES,
     AgreementError,
-    DownloadError,
     fetch,
     provide,
     unpack,
 )
 from qs3.datasets.published import PointDAH5, PublishedTree
-from qs3.errors import DataError
+from qs3.errors import DataError, Qs3Error
 from tests.fixtures import published as fixtures
 from tests.running import main
 
@@ -113,19 +112,19 @@ def test_a_broken_download_is_no_file_and_a_known_hash_is_checked(site, tmp_path
     source = SOURCES["specklenet10"]
     (site.folder / "cut.zip").write_bytes(speckle)
     cut = type(source)("cut", "", "", (), f"{site.address}/cut.zip")
-    with pytest.raises(DownloadError):
+    with pytest.raises(Qs3Error):
         fetch(cut, tmp_path / "cut.zip")
     assert list(tmp_path.iterdir()) == []
     (site.folder / "a.zip").write_bytes(speckle)
     for more in ({"sha256": "0" * 64}, {"size": 5}):
         wrong = type(source)("a", "", "", (), f"{site.address}/a.zip", **more)
-        with pytest.raises(DownloadError):
+        with pytest.raises(Qs3Error):
             fetch(wrong, tmp_path / "a.zip")
         assert list(tmp_path.iterdir()) == []
     known = {"sha256": hashlib.sha256(speckle).hexdigest(), "size": len(speckle)}
     right = type(source)("a", "", "", (), f"{site.address}/a.zip", **known)
     assert fetch(right, tmp_path / "a.zip").read_bytes() == speckle
-    with pytest.raises(DownloadError):
+    with pytest.raises(Qs3Error):
         get(site, "specklenet40", tmp_path)  # is not there
 
 

@@ -10,7 +10,7 @@ from torch_geometric.loader import DataLoader
 from torch_geometric.transforms import NormalizeScale, SamplePoints
 
 from qs3.datasets.domain import Domain
-from qs3.datasets.pyg import from_pyg, knn_graph, to_pyg
+from qs3.datasets.pyg import from_pyg, to_pyg
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.store.meta import ManifestRow
 from qs3.store.store import write_pointset
@@ -143,24 +143,3 @@ def test_what_does_not_fit_is_refused(tmp_path, items):
     with pytest.raises(Qs3Error):
         from_pyg({"train": items}, tmp_path / "a", classes=CLASSES)
     assert not (tmp_path / "a" / "meta.yaml").exists()
-
-
-def slow_edges(x, batch, k, loop):
-    """Each point's neighbours by sorting all distances to points of its cloud."""
-    edges = []
-    for i in range(len(x)):
-        same = [j for j in range(len(x)) if batch[j] == batch[i] and (loop or j != i)]
-        near = sorted(same, key=lambda j: float((x[j] - x[i]).square().sum()))
-        edges += [(j, i) for j in near[:k]]
-    return edges
-
-
-@pytest.mark.parametrize("loop", [False, True])
-@pytest.mark.parametrize("sizes", [(20,), (20, 20, 20), (20, 7, 1, 30), (5, 1)])
-@pytest.mark.parametrize("columns", [3, 5])
-def test_edges_equal_brute_force(sizes, loop, columns):
-    torch.manual_seed(1)
-    x = torch.randn(sum(sizes), columns)
-    batch = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
-    found = knn_graph(x, None if len(sizes) == 1 else batch, 6, loop=loop)
-    assert [tuple(edge) for edge in found.T.tolist()] == slow_edges(x, batch, 6, loop)
