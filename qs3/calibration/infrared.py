@@ -18,7 +18,7 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.gradients import Pair, Twin, View, blurred, exposed, settings_of
+from qs3.sensors.gradients import Twin, View, blurred, exposed, settings_of
 from qs3.sensors.optics.infrared import InfraredCamera
 
 KEYS = ("ambient", "infrared.psf_px", "infrared.read_noise_e")
@@ -57,12 +57,12 @@ def fit_light(
     """
     pairs = [[torch.from_numpy(image) for image in pair] for pair in zip(lit, dark, strict=True)]
     wanted = torch.stack([_compared(*pair) for pair in pairs]).mean(dim=0)
-    twin = Twin(_facing(base, distance_m), fine=3)
-    start = settings_of(twin.pair, 1.0)
+    start = settings_of(base, 1.0)
     camera = base.infrared
     assert isinstance(camera, InfraredCamera), "the base has no linear camera"
     with torch.no_grad():
-        projected, _ = twin.radiance(start | {"ambient": torch.zeros(())})
+        light = start | {"ambient": torch.zeros(())}
+        projected = _facing(base, distance_m).radiance(light, 0)
     off_grey = float(np.mean([image.mean() for image in dark]))
     first = [max(float(start[key]), least) for key, least in zip(KEYS, (0.01, 0.3, 1), strict=True)]
 
@@ -70,10 +70,9 @@ def fit_light(
         numbers = dict(zip(KEYS, torch.tensor(first) * torch.exp(logs), strict=True))
         settings = start | numbers | {"gain": off_grey / numbers["ambient"]}
         even = numbers["ambient"].expand(projected.shape)
-        apart = None if camera.ambient_speckles else even
         noise = torch.Generator().manual_seed(0)
-        on = exposed(even + projected, settings, noise, False, apart, camera.max_exposure)
-        off = exposed(even, settings, noise, False, apart, camera.max_exposure)
+        on = exposed(camera, even + projected, even, settings, noise)
+        off = exposed(camera, even, even, settings, noise)
         return (_compared(on, off) / wanted - 1) / _ERROR
 
     jacobian = torch.autograd.functional.jacobian
@@ -94,14 +93,14 @@ def _compared(on: torch.Tensor, off: torch.Tensor) -> torch.Tensor:
     return torch.cat([light, statistics(on), statistics(off)[:1]])
 
 
-def _facing(base: SpeckleStereo, distance_m: float) -> Pair:
+def _facing(base: SpeckleStereo, distance_m: float) -> Twin:
     """A white plane that faces the cameras, a square of pixels in the middle of the view."""
     k, side = base.intrinsics, 320
     window = Window((k.width_px - side) // 2, (k.height_px - side) // 2, side, side)
     one = torch.ones(side, side, dtype=torch.float64)
     plane = torch.stack([0 * one, 0 * one, one / distance_m], dim=-1)
     view = View(window, plane, one, one, one > 0)
-    return Pair(base, view, view)
+    return Twin(base, view, view, fine=3)
 
 
 def fit_pictures(folder: Path, base: str, distance_m: float) -> str:
