@@ -114,7 +114,6 @@ def write(
 
 
 def _line(name: str, rows: pd.DataFrame, bands: Sequence[Band]) -> dict[str, object]:
-    """A sensor's line of the page."""
     own = [band for band in bands if band.sensor == name]
     facing = rows[rows.tilt_deg == 0]
     sigma, fill = facing.set_index("depth_m").sigma_m, rows.groupby("tilt_deg").fill.mean()
@@ -175,7 +174,6 @@ def exponent(facing: pd.DataFrame) -> float:
 
 
 def _farthest(values: pd.Series | np.ndarray, middle: float) -> float:
-    """The value that is the farthest from the middle of its band."""
     values = np.asarray(values, dtype=float)
     if np.isnan(values).all():
         return np.nan

@@ -24,12 +24,7 @@ def fit_walls(
     distances: Sequence[float] = (),
     baseline: float | None = None,
 ) -> tuple[str, Noise]:
-    """The preset, a file of conf/sensor, and the noise; see `qs3 fit --help` for the arguments.
-
-    Raises:
-        ConfigError: no camera, frames of several sizes, or distances that cannot be theirs.
-        MissingDataError, DataError: a file is missing, damaged or not of a flat wall.
-    """
+    """The preset, a file of conf/sensor, and the noise; see `qs3 fit --help` for the arguments."""
     scale_m = None if unit is None else _METRES.get(unit) or 1 / float(unit)
     frames = [read_depth(path, scale_m) for path in files]
     if len({frame.shape for frame in frames}) != 1:

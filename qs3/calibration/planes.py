@@ -16,7 +16,7 @@ import numpy as np
 from qs3.calibration.subject import POSE, Subject, box_of, quad
 from qs3.geometry.cameras import Intrinsics, Window
 from qs3.sensors.base import DepthFrame
-from qs3.sensors.renderers.base import Body, Renderer
+from qs3.sensors.renderers.base import Renderer
 
 _TRIM = 0.005
 _GOLDEN = (5**0.5 - 1) / 2
@@ -64,14 +64,7 @@ class TiltedPlane:
         v = round(k.cy_px + self.centre_px[1])
         return Window(u - wide, v - high, 2 * wide + 1, 2 * high + 1)
 
-    def scene(
-        self, k: Intrinsics, region: Window, margin_px: int
-    ) -> tuple[tuple[Body, ...], np.ndarray]:
-        """The plane, three margins wider than `region`, and the [2, 3] box of one margin."""
-        body = quad(self._corners(k, region, 3 * margin_px))
-        return (body,), box_of(self._corners(k, region, margin_px))
-
-    def _corners(self, k: Intrinsics, region: Window, margin_px: int) -> np.ndarray:
+    def corners(self, k: Intrinsics, region: Window, margin_px: int) -> np.ndarray:
         """[4, 3] where the rays through the corners of a grown region meet the plane."""
         low_u, low_v = region.left - margin_px - k.cx_px, region.top - margin_px - k.cy_px
         high_u = low_u + region.width - 1 + 2 * margin_px
@@ -116,12 +109,10 @@ def measure(
     """Render and measure planes around one depth, at one tilt.
 
     Args:
-        subject, renderer: what is tested, and what makes its images.
         depth_m: in the middle of the depths of the planes.
         tilt_deg: angle of incidence, 0..85; both signs of it are pooled.
         along: the planes recede along the baseline, else across it.
-        phases: how many planes; their disparities are spread over one whole pixel, so that
-            every sub-pixel place of a match counts alike.
+        phases: how many planes; see `phases_m`.
         half_px: half the side of the region that is measured, in samples of the depth image.
 
     Returns:
@@ -133,7 +124,7 @@ def measure(
         accuracy: bias over depth.
         subpixel_rms_px: of the disparity about the plane fitted to each image.
         bias_px: as bias_m, of the disparity.
-        correlation_px: over how many pixels noise is shared, see `correlation_px`.
+        correlation_px: see `correlation_px`.
     """
     found: dict[str, list[Any]] = defaultdict(list)
     fb, facing = subject.focal_baseline, tilt_deg == 0
@@ -176,8 +167,9 @@ def take(
     """A frame of a plane, and the samples of it (rows, columns) that lie in the region."""
     k, step = subject.sensor.intrinsics, subject.step_px
     region = plane.region(k, half_px * step, step)
-    bodies, box = plane.scene(k, region, subject.margin_px)
-    frame = subject.sensor.scan(bodies, box, POSE, renderer, rng)
+    body = quad(plane.corners(k, region, 3 * subject.margin_px))
+    box = box_of(plane.corners(k, region, subject.margin_px))
+    frame = subject.sensor.scan((body,), box, POSE, renderer, rng)
     assert frame is not None, "the plane is outside the view"
     rows = _samples(region.top, region.height, frame.top, frame.step_px)
     cols = _samples(region.left, region.width, frame.left, frame.step_px)

@@ -99,11 +99,6 @@ class Shot:
     explain: bool
     lighting: Lighting | None = None
 
-    @property
-    def window(self) -> Window:
-        """The pixels that are rendered."""
-        return self.camera.rendered
-
     def seed(self) -> int:
         """A seed for the renderer, drawn from `rng`."""
         return int(self.rng.integers(2**31))
@@ -114,10 +109,12 @@ class Shot:
         ambient = ambient if place.ambient is None else place.ambient
         return Scene(self.bodies, projector, ambient, place.area)
 
-    def image(self, projector: Projector | None = None, ambient: float = 0.0) -> Image:
-        """What the camera sees, with the geometry; draws a seed."""
-        scene = self.scene(projector, ambient)
-        (image,) = self.renderer.render(scene, [self.camera], seed=self.seed(), geometry=[True])
+    def image(
+        self, projector: Projector | None = None, ambient: float = 0.0, seed: int | None = None
+    ) -> Image:
+        """What the camera sees, with the geometry; without a `seed` it draws one."""
+        scene, seed = self.scene(projector, ambient), self.seed() if seed is None else seed
+        (image,) = self.renderer.render(scene, [self.camera], seed=seed, geometry=[True])
         return image
 
     def pose_at(self, right_m: float) -> np.ndarray:
@@ -149,7 +146,7 @@ class Shot:
 
     def samples(self, step_px: int = 1, offset_px: int | None = None) -> Samples:
         """Samples of the window, on one grid over the whole image; see `on_grid`."""
-        window = self.window
+        window = self.camera.rendered
         left, columns = on_grid(window.left, window.width, step_px, offset_px)
         top, rows = on_grid(window.top, window.height, step_px, offset_px)
         return Samples(left, top, step_px, (rows, columns))

@@ -172,7 +172,7 @@ def twin_of(
         albedo = np.where(np.isfinite(even.depth_m), even.radiance, 0).astype(np.float64)
         lit = reached_from(bodies, camera, projector, renderer).astype(np.float64)
         views.append(View(window, *map(torch.from_numpy, (plane, albedo, lit, smooth))))
-    return Twin(sensor, *views)
+    return Twin(sensor, views[0], views[1])
 
 
 def _planes(depth_m: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -68,7 +68,7 @@ class DotMask(TriangulatingSensor):
 
     def take(self, shot: Shot) -> DepthFrame:
         """See `DepthSensor.take`. Shadow is always explained: the mask needs it anyway."""
-        window = shot.window
+        window = shot.camera.rendered
         # One render for both: what the projector reaches is what a white lamp there lights.
         image = shot.image(white_lamp(shot.pose_at(self.baseline_m)))
         clean, lit = image.depth_m, image.radiance > 0

@@ -80,7 +80,11 @@ class FringeCode:
             periods of the finer fringes, the least fitting pair of neighbouring fringes is apart,
             0..0.5.
         """
-        phase, modulation = phase_of(exposures)
+        angle = (2 * np.pi / self.steps) * np.arange(self.steps)
+        real = np.einsum("n,fnhw->fhw", np.cos(angle), exposures, optimize=False)
+        imaginary = -np.einsum("n,fnhw->fhw", np.sin(angle), exposures, optimize=False)
+        phase = np.arctan2(imaginary, real)
+        modulation = np.hypot(real, imaginary) * (2 / self.steps)
         turns = phase[0] / (2 * np.pi) % 1  # periods of the first fringes, counted from s = 0
         worst = np.zeros_like(turns)
         for level in range(1, len(self.periods)):
@@ -90,15 +94,6 @@ class FringeCode:
             turns = whole + fraction
             worst = np.maximum(worst, np.abs(expected - turns))
         return turns / self.periods[-1], modulation, worst
-
-
-def phase_of(exposures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Phase in -pi..pi and modulation [..., h, w] of N equal steps [..., N, h, w]."""
-    steps = exposures.shape[-3]
-    angle = (2 * np.pi / steps) * np.arange(steps)
-    real = np.einsum("n,...nhw->...hw", np.cos(angle), exposures, optimize=False)
-    imaginary = -np.einsum("n,...nhw->...hw", np.sin(angle), exposures, optimize=False)
-    return np.arctan2(imaginary, real), np.hypot(real, imaginary) * (2 / steps)
 
 
 @settings

@@ -89,19 +89,16 @@ class ReferenceSpeckle(TriangulatingSensor):
             self.tan_half_width,
             strength=self.reference_m**2,  # white at reference_m has radiance 1
         )
-        camera, seed = [shot.camera], shot.seed()
-        lit = shot.scene(projector, self.ambient)
-        (image,) = shot.renderer.render(lit, camera, seed=seed, geometry=[True])
+        seed = shot.seed()
         ambient = None
+        image = shot.image(projector, self.ambient, seed)
         if self.infrared.needs_ambient:
-            dim = shot.scene(None, self.ambient)
-            (other,) = shot.renderer.render(dim, camera, seed=seed, geometry=[False])
-            ambient = other.radiance
+            ambient = shot.image(None, self.ambient, seed).radiance
         gain = self.infrared.gain(image.radiance, self.infrared.metered(image, usual="image"))
         grey = self.infrared.expose(image.radiance, gain, shot.rng, ambient)
-        rows, columns = shot.window.slices
+        rows, columns = shot.camera.rendered.slices
         matcher = for_picture(self.matcher, self.infrared.noise(gain))
-        match = matcher.match(grey, self.reference[rows], shot.window.left)
+        match = matcher.match(grey, self.reference[rows], shot.camera.rendered.left)
         depth, disparity, reason = self.depth_of(match)
         pictures = {"left": grey, "disparity": disparity, "clean": image.depth_m}
         if shot.explain:

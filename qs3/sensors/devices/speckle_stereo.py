@@ -90,10 +90,13 @@ class SpeckleStereo(TriangulatingSensor):
         scene = shot.scene(projector, self.ambient)
         # Only the left image gets a depth.
         images = shot.renderer.render(scene, cameras, seed=seed, geometry=[True, False])
-        windows = (shot.window, window)
+        windows = (shot.camera.rendered, window)
         canvas = self._canvas(*windows)
-        metered = self.infrared.metered(images[0], usual="object")
-        gain = self.infrared.gain(images[0].radiance, metered)
+        gain, matcher = 1.0, self.matcher
+        if isinstance(self.infrared, InfraredCamera):
+            metered = self.infrared.metered(images[0], usual="object")
+            gain = self.infrared.gain(images[0].radiance, metered)
+            matcher = for_picture(matcher, self.infrared.noise(gain))
         radiance = self._seen(images, windows, canvas)
         ambient: list[np.ndarray] | list[None] = [None, None]
         if self.infrared.needs_ambient:
@@ -105,17 +108,13 @@ class SpeckleStereo(TriangulatingSensor):
             self.infrared.expose(total, gain, shot.rng, other)
             for total, other in zip(radiance, ambient, strict=True)
         ]
-        matcher = self.matcher
-        if isinstance(self.infrared, InfraredCamera):
-            matcher = for_picture(matcher, self.infrared.noise(gain))
         match = matcher.match(grey[0], grey[1])
         if self.blind_left_px:
             blind = slice(0, max(0, self.blind_left_px - canvas.left))
             match.reason[:, blind], match.disparity[:, blind] = Reason.OUTSIDE, np.nan
         depth, disparity, reason = self.depth_of(match)
-        inside = replace(
-            shot.window, left=shot.window.left - canvas.left, top=shot.window.top - canvas.top
-        ).slices
+        seen = shot.camera.rendered
+        inside = replace(seen, left=seen.left - canvas.left, top=seen.top - canvas.top).slices
         pictures = {
             "left": grey[0][inside],
             "right": grey[1][inside],
@@ -133,7 +132,7 @@ class SpeckleStereo(TriangulatingSensor):
     ) -> list[np.ndarray]:
         """The radiance [h, w] of the left and the right image on the canvas, through the lenses."""
         left, right = (_place(*seen, canvas) for seen in zip(images, windows, strict=True))
-        return [left, self.misalignment.seen(right, canvas, self.intrinsics)]
+        return [left, self.misalignment.seen(right, canvas)]
 
     def _canvas(self, left: Window, right: Window) -> Window:
         """Where both images lie side by side, with room for the matcher's reach around them.
@@ -150,7 +149,6 @@ class SpeckleStereo(TriangulatingSensor):
 
 
 def _place(image: Image, window: Window, canvas: Window) -> np.ndarray:
-    """The radiance of `window` on a dark canvas."""
     out = np.zeros((canvas.height, canvas.width), dtype=np.float32)
     row, col = window.top - canvas.top, window.left - canvas.left
     out[row : row + window.height, col : col + window.width] = image.radiance

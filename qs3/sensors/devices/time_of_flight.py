@@ -96,7 +96,7 @@ class TimeOfFlight(DepthSensor):
 
     def take(self, shot: Shot) -> DepthFrame:
         """See `DepthSensor.take`. The lamp's light is rendered anyway, so shadow is explained."""
-        window = shot.window
+        window = shot.camera.rendered
         fine, other = self._render(shot)
         lamp_light = _pixel_mean(fine.radiance, self.supersampling)
         mean_e = self.electrons_at_1m * (lamp_light + other)
@@ -136,7 +136,7 @@ class TimeOfFlight(DepthSensor):
 
     def _render(self, shot: Shot) -> tuple[Image, np.ndarray]:
         """The lamp's light in a camera with finer pixels, and radiance of other light [h, w]."""
-        n, window, seed = self.supersampling, shot.window, shot.seed()
+        n, window, seed = self.supersampling, shot.camera.rendered, shot.seed()
         small = Intrinsics.centred(self.width_px * n, self.height_px * n, self.focal_px * n)
         part = Window(window.left * n, window.top * n, window.width * n, window.height * n)
         lamp = white_lamp(shot.pose_at(self.lamp_offset_m))

@@ -3,10 +3,9 @@
 from qs3.sensors.matching.base import Match, Matcher
 from qs3.sensors.matching.census import CensusMatcher
 from qs3.sensors.matching.correlation import ReferenceMatcher
-from qs3.sensors.matching.opencv import STEREOBM_BIAS_PX, StereoBlockMatcher
+from qs3.sensors.matching.opencv import StereoBlockMatcher
 
 __all__ = [
-    "STEREOBM_BIAS_PX",
     "CensusMatcher",
     "Match",
     "Matcher",

@@ -269,12 +269,9 @@ class CensusMatcher:
 
 
 def _best_of_other(total: np.ndarray) -> np.ndarray:
-    """Best place of each pixel of the other image, from the same costs.
+    """[h, w + D - 1] place j of the lowest total[v, x - j, j] for each column x of the other image.
 
     `total` is [h, w, D]; place [v, u, j] is column u + j of the other image.
-
-    Returns:
-        [h, w + D - 1] place j of the lowest total[v, x - j, j] for each column x.
     """
     height, width, count = total.shape
     out = np.empty((height, width + count - 1), dtype=np.intp)

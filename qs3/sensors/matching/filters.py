@@ -82,19 +82,12 @@ class SpatialFilter:
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""
-        out = np.array(disparity, dtype=np.float32)
-        for _ in range(self.iterations):
-            for axis in (1, 0):
-                lines = np.ascontiguousarray(np.moveaxis(out, axis, 0))
-                for ordered in (lines, lines[::-1]):
-                    self._along(ordered)
-                out = np.moveaxis(lines, 0, axis)
+        out, alpha = np.array(disparity, dtype=np.float32), np.float32(self.alpha)
+        for axis in (1, 0) * self.iterations:
+            lines = np.ascontiguousarray(np.moveaxis(out, axis, 0))
+            for before, here in (*itertools.pairwise(lines), *itertools.pairwise(lines[::-1])):
+                with np.errstate(invalid="ignore"):
+                    near = np.abs(here - before) <= self.max_step_px  # false for NaN
+                np.copyto(here, alpha * here + (1 - alpha) * before, where=near)
+            out = np.moveaxis(lines, 0, axis)
         return np.ascontiguousarray(out)
-
-    def _along(self, lines: np.ndarray) -> None:
-        """[n, m]: row i from row i - 1, in place."""
-        alpha = np.float32(self.alpha)
-        for before, here in itertools.pairwise(lines):
-            with np.errstate(invalid="ignore"):
-                near = np.abs(here - before) <= self.max_step_px  # false for NaN
-            np.copyto(here, alpha * here + (1 - alpha) * before, where=near)

@@ -10,9 +10,9 @@ from qs3.sensors.matching.base import Match, columns_of
 from qs3.sensors.optics.visibility import Reason
 from qs3.utils.settings import IsOdd, settings
 
-STEREOBM_BIAS_PX = 7.5 / 256
-"""OpenCV's StereoBM computes 1/256 px, adds 15 and shifts by 4 bits: it rounds up to the
-next 1/16 px, which is on average 7.5/256 px too much (modules/calib3d/src/stereobm.cpp)."""
+# OpenCV's StereoBM computes 1/256 px, adds 15 and shifts by 4 bits: it rounds up to the
+# next 1/16 px, which is on average 7.5/256 px too much (modules/calib3d/src/stereobm.cpp).
+_BIAS_PX = 7.5 / 256
 
 
 @settings
@@ -23,7 +23,8 @@ class StereoBlockMatcher:
         num_disparities: how many disparities are searched, a multiple of 16.
         block_size: side of the block in px, odd, 5..255.
         texture_threshold, uniqueness_ratio: as in OpenCV.
-        remove_bias: subtract STEREOBM_BIAS_PX (the released code does not).
+        remove_bias: subtract the 7.5/256 px by which StereoBM is off (the released code
+            does not).
         min_disparity: where the search begins. With 0, a disparity of 0 (a point at infinity)
             counts as no match, as in the released code.
         max_difference_px: matching the other way round must give the same disparity to so many
@@ -61,16 +62,12 @@ class StereoBlockMatcher:
         disparity = matcher.compute(left, right)[place].astype(np.float32) / 16
         disparity[disparity <= (low - 1 if low else 0)] = np.nan  # OpenCV's mark
         if self.remove_bias:
-            disparity -= np.float32(STEREOBM_BIAS_PX)
-        dark = self._texture(left) < self.texture_threshold
+            disparity -= np.float32(_BIAS_PX)
+        # What OpenCV compares: the sum over the block of the x-Sobel response, clipped to the
+        # pre-filter's cap of 31.
+        response = np.abs(np.clip(cv2.Sobel(left, cv2.CV_32F, 1, 0), -31, 31))
+        size = (self.block_size, self.block_size)
+        texture = cv2.boxFilter(response, cv2.CV_32F, size, normalize=False)
+        dark = texture < self.texture_threshold
         why_not = np.where(dark, np.uint8(Reason.DARK), np.uint8(Reason.UNMATCHED))
         return Match.of(disparity, why_not[place])
-
-    def _texture(self, canvas: np.ndarray) -> np.ndarray:
-        """[h, w] float32: what OpenCV compares with texture_threshold.
-
-        The sum over the block of the x-Sobel response, clipped to the pre-filter's cap of 31.
-        """
-        response = np.abs(np.clip(cv2.Sobel(canvas, cv2.CV_32F, 1, 0), -31, 31))
-        size = (self.block_size, self.block_size)
-        return cv2.boxFilter(response, cv2.CV_32F, size, normalize=False)

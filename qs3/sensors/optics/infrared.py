@@ -109,7 +109,8 @@ class InfraredCamera:
         """
         per_grey = self.electrons_at_white / 255.0 / self.amplified(gain)
         if self.speckle_contrast:  # before the lens: grains are as small as its blur or smaller
-            grains = self._grains(radiance.shape, rng)
+            k = 1 / self.speckle_contrast**2
+            grains = rng.standard_gamma(k, radiance.shape, dtype=np.float32) / np.float32(k)
             if ambient is None:
                 radiance = radiance * grains
             else:
@@ -122,11 +123,6 @@ class InfraredCamera:
         sigma = np.sqrt(np.maximum(electrons, 0) + np.float32(self.read_noise_e**2))
         noisy = electrons + sigma * rng.standard_normal(radiance.shape, dtype=np.float32)
         return np.clip(np.rint(noisy / np.float32(per_grey)), 0, 255).astype(np.uint8)
-
-    def _grains(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-        """[h, w] float32 Gamma variables with mean 1."""
-        k = 1 / self.speckle_contrast**2
-        return rng.standard_gamma(k, shape, dtype=np.float32) / np.float32(k)
 
 
 # Logarithms to base 2 of the radiance where the curve begins and where it ends.
@@ -164,7 +160,7 @@ def filmic(radiance: np.ndarray) -> np.ndarray:
 class FilmicCamera:
     """A camera without noise whose picture is a tone-mapped 8-bit file, as released.
 
-    Its exposure is fixed: radiance has to come in Blender's units.
+    Its exposure is fixed (gain 1): radiance has to come in Blender's units.
 
     Attributes:
         background: radiance of the surroundings behind the object (the released scene's grey
@@ -176,14 +172,6 @@ class FilmicCamera:
     background: NotNegative = 0.0
     faintest: Positive = 0.216
     needs_ambient: ClassVar[bool] = False
-
-    def metered(self, image: Image, usual: str) -> np.ndarray:
-        """The pixels [h, w] bool of the object; nothing depends on them."""
-        return image.label > 0
-
-    def gain(self, radiance: np.ndarray, region: np.ndarray) -> float:
-        """1: exposure 0, whatever is seen."""
-        return 1.0
 
     def expose(
         self,

@@ -7,7 +7,7 @@ import numpy as np
 from annotated_types import Interval
 from scipy.ndimage import map_coordinates
 
-from qs3.geometry.cameras import Intrinsics, Window
+from qs3.geometry.cameras import Window
 from qs3.utils.settings import Positive, settings
 
 _WAVES = 64
@@ -59,21 +59,17 @@ class Misalignment:
         """By how much a pixel is shifted at most: four times the fields' RMS."""
         return math.ceil(4 * max(self.rows_px, self.columns_px))
 
-    def seen(self, image: np.ndarray, canvas: Window, k: Intrinsics) -> np.ndarray:
+    def seen(self, image: np.ndarray, canvas: Window) -> np.ndarray:
         """The picture [h, w] float32 of the right camera in place of the ideal `image`.
 
-        `canvas` is where its pixels lie in the whole image, whose intrinsics are `k`.
+        `canvas` is where its pixels lie in the whole image.
         """
         if not self.reach_px:
             return image
-        u = np.arange(canvas.width, dtype=np.float64) + canvas.left
-        v = np.arange(canvas.height, dtype=np.float64)[:, None] + canvas.top
-        x, y = np.broadcast_arrays((u - k.cx_px) / k.focal_px, (v - k.cy_px) / k.focal_px)
-        at_u = x * k.focal_px + k.cx_px - canvas.left
-        at_v = y * k.focal_px + k.cy_px - canvas.top
         rng = np.random.default_rng([0x3EC7, self.seed])
-        at_v = at_v - self.rows_px * smooth_field(canvas, self.cell_px, rng)
-        at_u = at_u - self.columns_px * smooth_field(canvas, self.cell_px, rng)
+        rows, columns = np.arange(canvas.height)[:, None], np.arange(canvas.width)
+        at_v = rows - self.rows_px * smooth_field(canvas, self.cell_px, rng)
+        at_u = columns - self.columns_px * smooth_field(canvas, self.cell_px, rng)
         # Not OpenCV's cubic: it rounds places to 1/32 px, and is up to 0.05 px off on a ramp.
         found = map_coordinates(image, [at_v, at_u], order=3, mode="grid-constant")
         return np.maximum(found, 0)  # a spline undershoots beside bright dots

@@ -16,34 +16,20 @@ from qs3.sensors.renderers.base import Body, Projector, Renderer, Scene
 
 
 class Reason(IntEnum):
-    """One for each pixel; what comes first in this list wins where several hold.
+    """One for each pixel; what comes first in this list wins where several hold."""
 
-    OK: it has a depth.
-    EMPTY: no surface there, or none in reach.
-    SHADOW: the projector does not reach the surface.
-    OCCLUDED: the other camera does not see the surface.
-    OUTSIDE: the other image, or the pattern, ends before it.
-    DARK: too little light or contrast.
-    SATURATED: too much light.
-    AMBIGUOUS: several places match as well.
-    INCONSISTENT: matching the other way round gives another place.
-    RANGE: a depth was found, outside the range of the sensor.
-    FILTERED: a depth was found and a filter removed it.
-    UNMATCHED: none of these, or the matcher does not tell.
-    """
-
-    OK = 0
-    EMPTY = 1
-    SHADOW = 2
-    OCCLUDED = 3
-    OUTSIDE = 4
-    DARK = 5
-    SATURATED = 6
-    AMBIGUOUS = 7
-    INCONSISTENT = 8
-    RANGE = 9
-    FILTERED = 10
-    UNMATCHED = 11
+    OK = 0  # it has a depth
+    EMPTY = 1  # no surface there, or none in reach
+    SHADOW = 2  # the projector does not reach the surface
+    OCCLUDED = 3  # the other camera does not see the surface
+    OUTSIDE = 4  # the other image, or the pattern, ends before it
+    DARK = 5  # too little light or contrast
+    SATURATED = 6  # too much light
+    AMBIGUOUS = 7  # several places match as well
+    INCONSISTENT = 8  # matching the other way round gives another place
+    RANGE = 9  # a depth was found, outside the range of the sensor
+    FILTERED = 10  # a depth was found and a filter removed it
+    UNMATCHED = 11  # none of these, or the matcher does not tell
 
 
 def first_reason(causes: Mapping[Reason, np.ndarray], otherwise: Reason) -> np.ndarray:
@@ -52,13 +38,9 @@ def first_reason(causes: Mapping[Reason, np.ndarray], otherwise: Reason) -> np.n
     return np.select(list(causes.values()), reasons, np.uint8(otherwise)).astype(np.uint8)
 
 
-_WHITE = np.ones((2, 2), dtype=np.float32)
-_WIDE = 10.0  # tangent of half the lamp's angle: all that lies before it
-
-
 def white_lamp(world_from_lamp: np.ndarray) -> Projector:
     """A point lamp at a pose [4, 4]; it lights all before it, white at 1 m to radiance 1."""
-    return Projector(world_from_lamp, _WHITE, _WIDE)
+    return Projector(world_from_lamp, np.ones((2, 2), dtype=np.float32), tan_half_width=10.0)
 
 
 def reached_from(
@@ -92,9 +74,6 @@ def explained(
     return out
 
 
-_ROOM = 1.1  # the plane and the slide are larger than the view by this factor
-
-
 def sample_centres(camera: Camera, renderer: Renderer, seed: int) -> np.ndarray:
     """[h, w] float64: the mean column of each pixel's samples, in px of the whole image.
 
@@ -108,8 +87,9 @@ def sample_centres(camera: Camera, renderer: Renderer, seed: int) -> np.ndarray:
     k, window = camera.intrinsics, camera.rendered
     ends_x = np.abs(np.array([window.left - 1, window.left + window.width]) - k.cx_px)
     ends_y = np.abs(np.array([window.top - 1, window.top + window.height]) - k.cy_px)
-    half = _ROOM * float(max(ends_x.max(), ends_y.max())) / k.focal_px
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half * _ROOM
+    room = 1.1  # the plane and the slide are larger than the view by this factor
+    half = room * float(max(ends_x.max(), ends_y.max())) / k.focal_px
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half * room
     local = np.column_stack([corners, np.ones(4)])
     pose = camera.world_from_camera
     vertices = local @ pose[:3, :3].T + pose[:3, 3]

@@ -51,12 +51,7 @@ class Device:
 
 
 class BlenderRenderer:
-    """A `Renderer` on Blender's Cycles.
-
-    Attributes:
-        settings: samples a pixel and threads.
-        device: on what it renders.
-    """
+    """A `Renderer` on Blender's Cycles."""
 
     def __init__(
         self, samples: int = 16, threads: int = 1, device: str = "auto", name: str = "blender"
@@ -64,8 +59,7 @@ class BlenderRenderer:
         """Start Blender inside this process.
 
         Args:
-            samples: samples a pixel.
-            threads: 0 is all cores.
+            samples, threads: see `RendererSettings`.
             device: "auto" (a GPU if Blender lists one for OptiX or CUDA, else the CPU), "cpu"
                 or "gpu". The two make different bytes, so a dataset's recipe says which it was.
             name: what the configuration calls it; taken so that its node can be instantiated.
@@ -104,7 +98,6 @@ class BlenderRenderer:
     def _render(
         self, scene: Scene, cameras: list[Camera], seed: int, geometry: list[bool], folder: Path
     ) -> list[Image]:
-        """`render` without the handling of errors and noise."""
         bpy = self._bpy
         # Takes some 20 ms, and undoes what other code of this process did to the global state.
         bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -152,7 +145,6 @@ class BlenderRenderer:
         geometry: list[bool],
         folder: Path,
     ) -> list[Image]:
-        """The Blender scene as it stands, once for each camera."""
         layer, images = target.view_layers[0], []
         for index, (camera, wanted) in enumerate(zip(cameras, geometry, strict=True)):
             _aim(target, eye, camera)
@@ -190,7 +182,6 @@ def list_gpus(bpy: Any) -> dict[str, list[str]]:
 
 
 def _use(bpy: Any, cycles: Any, device: Device) -> None:
-    """Set Blender's preferences and a scene's Cycles to `device`."""
     cycles.device = "CPU" if device.backend == "CPU" else "GPU"
     if cycles.device == "GPU":
         _preferences(bpy).compute_device_type = device.backend
@@ -297,7 +288,6 @@ def _configure(target: Any, settings: RendererSettings) -> None:
 
 
 def _aim(target: Any, eye: Any, camera: Camera) -> None:
-    """Pose, lens and window of the camera."""
     k, window, render = camera.intrinsics, camera.rendered, target.render
     eye.matrix_world = blender_pose(camera.world_from_camera)
     lens = eye.data

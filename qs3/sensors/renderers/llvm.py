@@ -81,7 +81,12 @@ def find_variant(variant: str = "auto") -> Probe:
     if inherited is not None and variant in ("auto", inherited.variant):
         return inherited
     if variant == "auto":
-        return _remember(_first_that_works())
+        if cuda_may_work() and try_variant("cuda_ad_mono", None) is None:
+            return _remember(Probe("cuda_ad_mono"))
+        try:
+            return _remember(_probe_llvm("llvm_ad_mono"))
+        except RenderError:
+            return _remember(Probe("scalar_rgb"))
     if variant.startswith("llvm_"):
         return _remember(_probe_llvm(variant))
     if variant.startswith("cuda_"):
@@ -119,18 +124,7 @@ def try_variant(variant: str, llvm_path: str | None) -> str | None:
     return f"{how}: {reason[:300]}"
 
 
-def _first_that_works() -> Probe:
-    """CUDA, LLVM, or the scalar variant, which needs nothing and always works."""
-    if cuda_may_work() and try_variant("cuda_ad_mono", None) is None:
-        return Probe("cuda_ad_mono")
-    try:
-        return _probe_llvm("llvm_ad_mono")
-    except RenderError:
-        return Probe("scalar_rgb")
-
-
 def _probe_llvm(variant: str) -> Probe:
-    """The newest libLLVM with which `variant` renders."""
     reasons = []
     for path in libllvm_candidates():
         reason = try_variant(variant, path)

@@ -31,12 +31,7 @@ from qs3.sensors.renderers.mitsuba_scalar import ScalarScene
 
 
 class MitsubaRenderer:
-    """A `Renderer` on Mitsuba 3.
-
-    Attributes:
-        settings: samples a pixel and threads.
-        variant: the Mitsuba variant in use.
-    """
+    """A `Renderer` on Mitsuba 3."""
 
     def __init__(
         self, samples: int = 16, threads: int = 1, variant: str = "auto", name: str = "mitsuba"
@@ -44,8 +39,7 @@ class MitsubaRenderer:
         """Find a variant that works here and load it.
 
         Args:
-            samples: samples a pixel.
-            threads: 0 is all cores.
+            samples, threads: see `RendererSettings`.
             variant: "auto", or a Mitsuba variant ("llvm_ad_mono", "cuda_ad_mono", "scalar_rgb").
             name: what the configuration calls it; taken so that its node can be instantiated.
         """
@@ -58,6 +52,8 @@ class MitsubaRenderer:
         self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
     ) -> list[Image]:
         """Render every camera; see `Renderer.render`."""
+        import drjit as dr
+
         mi = self._activate()
         try:
             built = self._build(mi, scene)
@@ -74,7 +70,8 @@ class MitsubaRenderer:
         except RuntimeError as error:
             raise RenderError(f"Mitsuba ({self.variant}) failed: {error}") from error
         finally:
-            _give_memory_back()
+            dr.flush_malloc_cache()  # it keeps what it frees, by size; every object has other sizes
+            give_memory_back()
         return images
 
     def provenance(self) -> dict[str, str]:
@@ -94,7 +91,6 @@ class MitsubaRenderer:
         return found
 
     def _build(self, mi: Any, scene: Scene) -> ScalarScene | JitScene:
-        """The scene for this variant; RenderError if it shows more than the variant can."""
         if not self.variant.startswith("scalar_"):
             return JitScene(mi, scene) if scene.plain else GlossyScene(mi, scene)
         if not scene.plain:
@@ -141,11 +137,3 @@ def render_probe_scene(variant: str) -> None:
     expected = body.albedo * (0.5 + 1 / 4)
     if not np.allclose(image.radiance, expected, rtol=1e-3) or not np.allclose(image.depth_m, 2):
         raise SystemExit(f"variant {variant} renders wrong values")
-
-
-def _give_memory_back() -> None:
-    """Dr.Jit keeps what it frees, by size; every object has other sizes."""
-    import drjit as dr
-
-    dr.flush_malloc_cache()
-    give_memory_back()

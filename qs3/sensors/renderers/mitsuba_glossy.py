@@ -1,6 +1,7 @@
 """The reflecting facets of `gloss`, for Mitsuba's compiled variants."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,51 +11,49 @@ from qs3.sensors.renderers.gloss import COSINES, Gloss, kept_back
 from qs3.sensors.renderers.mitsuba_jit import TO_UNIT, JitScene
 
 
+@dataclass
 class Facets:
     """Facets of the surfaces that a bundle of rays meets, by unit vectors.
 
     Attributes:
+        mi, dr: the modules.
+        normal: on the eye's side.
+        square: alpha^2; the rest as in `gloss`.
         cos_o: cosine of the angle to the eye.
     """
 
-    def __init__(
-        self,
-        mi: Any,
-        normal: Any,
-        to_eye: Any,
-        square: Any,
-        refractive_index: Any,
-        metal: Any,
-        albedo: Any,
-    ) -> None:
-        """`normal` is on the eye's side; `square` is alpha^2, the rest as in `gloss`."""
-        import drjit as dr
+    mi: Any
+    dr: Any
+    normal: Any
+    to_eye: Any
+    square: Any
+    refractive_index: Any
+    metal: Any
+    albedo: Any
 
-        self._mi, self._dr = mi, dr
-        self._normal, self._to_eye, self._square = normal, to_eye, square
-        self._index, self._metal, self._albedo = refractive_index, metal, albedo
-        self.cos_o = clip(dr, dr.dot(normal, to_eye), 1e-6, 1)
+    def __post_init__(self) -> None:
+        self.cos_o = clip(self.dr, self.dr.dot(self.normal, self.to_eye), 1e-6, 1)
 
     def times_pi(self, to_light: Any) -> Any:
         """Pi f of the facets alone."""
-        dr, square = self._dr, self._square
-        cos_i = clip(dr, dr.dot(self._normal, to_light), 1e-6, 1)
-        half = dr.normalize(to_light + self._to_eye)
+        dr, square = self.dr, self.square
+        cos_i = clip(dr, dr.dot(self.normal, to_light), 1e-6, 1)
+        half = dr.normalize(to_light + self.to_eye)
         seen = 0.5 / (
             cos_i * dr.sqrt(square + (1 - square) * dr.square(self.cos_o))
             + self.cos_o * dr.sqrt(square + (1 - square) * dr.square(cos_i))
         )
-        met = clip(dr, dr.dot(self._to_eye, half), 0, 1)
-        g = dr.sqrt(dr.square(self._index) - 1 + dr.square(met))
+        met = clip(dr, dr.dot(self.to_eye, half), 0, 1)
+        g = dr.sqrt(dr.square(self.refractive_index) - 1 + dr.square(met))
         other = (met * (g + met) - 1) / (met * (g - met) + 1)
         dielectric = 0.5 * dr.square((g - met) / (g + met)) * (1 + dr.square(other))
-        metal = self._albedo + (1 - self._albedo) * (1 - met) ** 5
-        return self._spread(half) * seen * dr.select(self._metal, metal, dielectric)
+        metal = self.albedo + (1 - self.albedo) * (1 - met) ** 5
+        return self._spread(half) * seen * dr.select(self.metal, metal, dielectric)
 
     def density(self, to_light: Any) -> Any:
         """Density of `reflected` over the solid angle (Heitz, JCGT 2018, eq. 17)."""
-        dr, square = self._dr, self._square
-        half = dr.normalize(to_light + self._to_eye)
+        dr, square = self.dr, self.square
+        half = dr.normalize(to_light + self.to_eye)
         masking = self.cos_o + dr.sqrt(square + (1 - square) * dr.square(self.cos_o))
         return self._spread(half) / (2 * dr.pi * masking)
 
@@ -63,9 +62,9 @@ class Facets:
 
         `s` and `t` are drawn from 0..1.
         """
-        mi, dr = self._mi, self._dr
-        alpha, frame = dr.sqrt(self._square), mi.Frame3f(self._normal)
-        eye = frame.to_local(self._to_eye)
+        mi, dr = self.mi, self.dr
+        alpha, frame = dr.sqrt(self.square), mi.Frame3f(self.normal)
+        eye = frame.to_local(self.to_eye)
         # Stretched to facets of slope 1.
         seen = dr.normalize(mi.Vector3f(alpha * eye.x, alpha * eye.y, eye.z))
         across = dr.square(seen.x) + dr.square(seen.y)
@@ -81,12 +80,12 @@ class Facets:
         slope = first * a + second * b + seen * up
         facet = mi.Vector3f(alpha * slope.x, alpha * slope.y, clip(dr, slope.z, 1e-6, 1))
         facet = frame.to_world(dr.normalize(facet))
-        return dr.normalize(facet * (2 * dr.dot(self._to_eye, facet)) - self._to_eye)
+        return dr.normalize(facet * (2 * dr.dot(self.to_eye, facet)) - self.to_eye)
 
     def _spread(self, half: Any) -> Any:
         """Pi D of the facets."""
-        dr, square = self._dr, self._square
-        across = dr.dot(self._normal, half)
+        dr, square = self.dr, self.square
+        across = dr.dot(self.normal, half)
         return square / dr.square(dr.square(across) * (square - 1) + 1)
 
 
@@ -111,13 +110,9 @@ class GlossyScene(JitScene):
         super().__init__(mi, scene)
         kinds = [body.gloss or _MATT for body in scene.bodies]
         self._body = mi.UInt32(self.faces.body)
-
-        def each(values: list[float]) -> Any:
-            return mi.Float(np.array(values, dtype=np.float32))
-
-        self._square = each([kind.alpha**2 for kind in kinds])
-        self._index = each([kind.refractive_index for kind in kinds])
-        self._metal = each([float(kind.metal) for kind in kinds])
+        numbers = [(kind.alpha**2, kind.refractive_index, float(kind.metal)) for kind in kinds]
+        columns = np.array(numbers, dtype=np.float32).T
+        self._square, self._index, self._metal = map(mi.Float, np.ascontiguousarray(columns))
         tables = np.concatenate([kept_back(kind) for kind in kinds])
         self._kept_back = mi.Float(tables.astype(np.float32))
         self._area = scene.area
@@ -180,7 +175,7 @@ class GlossyScene(JitScene):
             dr.gather(mi.Float, values, body, valid)
             for values in (self._square, self._index, self._metal)
         )
-        facets = Facets(mi, normal, to_eye, square, index, metal > 0, albedo)
+        facets = Facets(mi, dr, normal, to_eye, square, index, metal > 0, albedo)
         place = facets.cos_o * (COSINES - 1)
         low = mi.UInt32(clip(dr, place, 0, COSINES - 2))
         left, right = (

@@ -46,7 +46,7 @@ def test_pictures_have_no_noise_and_draw_nothing():
     camera = FilmicCamera()
     radiance = np.geomspace(0.01, 20, 64, dtype=np.float32).reshape(8, 8)
     rng = np.random.default_rng(0)
-    picture = camera.expose(radiance, camera.gain(radiance, radiance > 0), rng)
+    picture = camera.expose(radiance, 1.0, rng)
     assert picture.dtype == np.uint8
     np.testing.assert_array_equal(picture, np.rint(filmic(radiance)))
     assert rng.bit_generator.state == np.random.default_rng(0).bit_generator.state

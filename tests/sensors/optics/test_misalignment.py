@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qs3.geometry.cameras import Intrinsics, Window
+from qs3.geometry.cameras import Window
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.optics.misalignment import Misalignment
 from tests.sensors.scenery import middle, plane, scan
 
-K = Intrinsics.centred(200, 160, 180.0)
 WHOLE = Window(0, 0, 200, 160)
 
 
@@ -21,7 +20,7 @@ def ramps():
 
 
 def shifts(lens):
-    return [middle(lens.seen(ramp, WHOLE, K) - ramp) for ramp in ramps()]
+    return [middle(lens.seen(ramp, WHOLE) - ramp) for ramp in ramps()]
 
 
 def test_fields_shift_the_right_picture_alone_by_their_rms():
@@ -47,7 +46,7 @@ def test_columns_that_do_not_meet_are_a_bias_of_the_depth(renderer):
         error.append(np.nanmedian(off))
     ramp = np.arange(1080, dtype=np.float32)[None].repeat(3, 0)
     across = Window(0, 539, 1080, 3)
-    moved = lens.seen(ramp, across, sensor.intrinsics)[1, 540] - 540
+    moved = lens.seen(ramp, across)[1, 540] - 540
     assert abs(moved) > 0.3
     # Where the right picture shows what lies farther right, its disparity is larger.
     assert error[1] - error[0] == pytest.approx(moved, abs=0.1)
