@@ -29,7 +29,6 @@ def train(*overrides: str) -> Path:
     from omegaconf import OmegaConf
 
     from qs3.errors import ConfigError
-    from qs3.runs.folder import removed_if_unbegun
     from qs3.training.command import train as trained
     from qs3.training.run import run_of
     from qs3.utils.files import write_text
@@ -38,8 +37,7 @@ def train(*overrides: str) -> Path:
         raise ConfigError("hparams_search= is many runs: search with python train.py, or qs3-train")
     with _as_hydra("train", overrides) as cfg:
         folder = run_of(cfg).folder
-        with removed_if_unbegun(folder):
-            trained(cfg)
+        trained(cfg)
     # What Hydra leaves in a run's folder, which pictures and `qs3.report` read.
     write_text(folder / ".hydra" / "config.yaml", OmegaConf.to_yaml(cfg))
     write_text(folder / ".hydra" / "overrides.yaml", OmegaConf.to_yaml(list(overrides)))

@@ -6,7 +6,7 @@ from hydra.core.hydra_config import HydraConfig
 
 import qs3
 from qs3.api import generate, train
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, DataError
 from qs3.report.run_page import read_run
 from qs3.runs.metrics import read_metrics
 from qs3.tools.toy import SHAPES, ToyNet, toy_overrides, write_toy
@@ -63,13 +63,6 @@ def test_train_leaves_what_the_command_leaves(tmp_path):
 def test_wrong_words_are_errors_of_the_config(call, words):
     with pytest.raises(ConfigError):
         call(*words)
-
-
-def test_a_start_that_fails_leaves_no_folder(tmp_path):
-    dirs = (f"paths.data_dir={tmp_path / 'data'}", f"paths.log_dir={tmp_path / 'logs'}")
-    with pytest.raises(MissingDataError):
-        train("experiment=quickstart", *dirs, "data.make_source=false")
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
 def test_generate(tmp_path):

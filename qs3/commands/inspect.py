@@ -24,8 +24,8 @@ def inspect(
     """What a dataset is like, before training on it.
 
     What it is made of, counts by class and split, sizes, spacing, density, coverage, copies, leaks
-    from train to test, odd objects; a contact sheet of all classes and a page where clouds can be
-    turned. Published files are imported first.
+    from train to test; a contact sheet of all classes and a page where clouds can be turned.
+    Published files are imported first.
 
     Example:
         qs3 inspect domain=own published.folder=scans

@@ -87,9 +87,6 @@ def read_prior(
         classes: that the net knows.
         learnt: u, shares of the classes in its training, each above 0; None: all alike.
         power: t >= 0.
-
-    Raises:
-        ConfigError: what is given is not a prior, or names a class that the net does not know.
     """
     common: dict[str, float] = {}
     try:

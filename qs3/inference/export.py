@@ -15,7 +15,6 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,54 +47,35 @@ from qs3.utils.page import render
 from qs3.utils.version import VERSION
 
 ALLOWED = 1e-4  # difference of logits
-ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
 INPUT, OUTPUT = "points", "logits"
-_CHECKED = 32  # clouds to compare on
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
 _PRIVATE = ("paths.", "hydra.")  # overrides that no other machine needs
 _FEATURES = "qs3.models.features.features"  # a head on a file that has no place in a folder
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The exported net's logits and the net's own.
+def compared(theirs: Float[np.ndarray, "n c"], ours: Float[np.ndarray, "n c"]) -> tuple[bool, str]:
+    """Whether two nets' logits of the same clouds agree, and how far they differ.
 
     Where two neighbours or farthest points are equally far but for their last digits, a net may
-    take the other one: that happens to single clouds, an error to all.
+    take the other one: so a tenth of the clouds (one of a few) may differ by more than 1e-4.
     """
-
-    clouds: int
-    typical: float  # median over the clouds of the largest difference of a cloud's logits
-    largest: float
-    odd: int  # clouds that differ by more than `ALLOWED`
-
-    @classmethod
-    def of(cls, theirs: Float[np.ndarray, "n c"], ours: Float[np.ndarray, "n c"]) -> Comparison:
-        """Compare two nets' logits of the same n clouds."""
-        difference = np.abs(theirs - ours).max(axis=1)
-        odd = int((~(difference <= ALLOWED)).sum())  # NaN is odd
-        return cls(len(ours), float(np.median(difference)), float(difference.max()), odd)
-
-    @property
-    def agrees(self) -> bool:
-        """At most a tenth of the clouds differ by more than 1e-4 (one of a few)."""
-        return self.typical <= ALLOWED and self.odd <= max(1, int(ALLOWED_ODD * self.clouds))
-
-    def __str__(self) -> str:
-        return (
-            f"logits on {self.clouds} clouds differ by {self.typical:.1e} (median) and "
-            f"{self.largest:.1e} (largest); {self.odd} by more than {ALLOWED:g}"
-        )
+    difference = np.abs(theirs - ours).max(axis=1)
+    typical, odd = np.median(difference), int((~(difference <= ALLOWED)).sum())  # NaN is odd
+    words = (
+        f"logits on {len(ours)} clouds differ by {typical:.1e} (median) and "
+        f"{difference.max():.1e} (largest); {odd} by more than {ALLOWED:g}"
+    )
+    return bool(typical <= ALLOWED) and odd <= max(1, len(ours) // 10), words
 
 
 def export_file(ckpt: str | Path, out: Path, packages: Sequence[str] = PACKAGES) -> str:
     """Export the classifier of a run as an .onnx or .pt2 and compare; text for the terminal."""
     predictor = load(ckpt, packages=packages)
-    compared = export(predictor, out)
+    difference = export(predictor, out)
     points = f"{predictor.points}{' (or another number of)' if any_points(predictor) else ''}"
     how = "onnxruntime.InferenceSession" if out.suffix == ".onnx" else "torch.export.load"
     return (
-        f"{compared}\n"
+        f"{difference}\n"
         f"saved {out}: {how} reads it; it takes {INPUT!r}, float32 [clouds, points, 3],\n"
         f"any number of prepared clouds of {points} points, and gives {OUTPUT!r} of\n"
         f"{', '.join(predictor.classes)}"
@@ -174,21 +154,18 @@ def _command(run: Path) -> str:
     return shlex.join(["qs3-train", *(re.sub(r"=[/~].*/", "=", word) for word in words)])
 
 
-def export(
-    predictor: Predictor, out: Path, clouds: Float[Tensor, "n m 3"] | None = None
-) -> Comparison:
-    """Write the net to `out`, read it back, and compare it with the net, one cloud and many.
+def export(predictor: Predictor, out: Path, clouds: int = 32) -> str:
+    """Write the net to `out`, read it back, and compare it with the net on clouds that are made up.
 
-    `clouds`: prepared ones to compare on; None makes some up. Where torch cannot export the net, or
-    the logits differ, there is no file and a Qs3Error.
+    Where torch cannot export the net, or the logits differ, there is no file and a Qs3Error.
     """
     if out.suffix not in EXPORTED:
         raise ConfigError(f"out={out} must end in {' or '.join(EXPORTED)}, or be a folder")
-    clouds = made_up(predictor.points) if clouds is None else clouds
+    points = made_up(predictor.points, clouds)
     # A copy that is not trained: some operations of the graph have no gradients.
     net = copy.deepcopy(predictor.net).cpu().requires_grad_(False).eval()
     # Two, also where there is one: torch takes a size of 1 for one that never changes.
-    example = clouds[:1].repeat(2, 1, 1)
+    example = points[:1].repeat(2, 1, 1)
     make_folder(out.parent)
     # What torch compiled for another net's loops, whose sizes would become limits of this one's.
     torch.compiler.reset()
@@ -205,13 +182,13 @@ def export(
                     raise cause from error
                 target, first = predictor.result.model["_target_"], str(cause).strip()[:200]
                 raise Qs3Error(f"torch cannot export {target}: {first}") from error
-            ours = np.concatenate([net(part).numpy() for part in clouds.split(16)])
-            parts = [clouds[:1], *clouds[1:].split(15)]  # the number of clouds must not matter
+            ours = np.concatenate([net(part).numpy() for part in points.split(16)])
+            parts = [points[:1], *points[1:].split(15)]  # the number of clouds must not matter
             theirs = np.concatenate([run(part.contiguous()) for part in parts if len(part)])
-            compared = Comparison.of(theirs, ours)
-            if not compared.agrees:
-                raise Qs3Error(f"the exported net is not the same: {compared}; {out} not written")
-    return compared
+            same, words = compared(theirs, ours)
+            if not same:
+                raise Qs3Error(f"the exported net is not the same: {words}; {out} not written")
+    return words
 
 
 def any_points(predictor: Predictor) -> bool:
@@ -220,7 +197,7 @@ def any_points(predictor: Predictor) -> bool:
     return isinstance(net, PointClassifier) and predictor.points >= net.backbone.least_points
 
 
-def made_up(points: int, count: int = _CHECKED) -> Float[Tensor, "n m 3"]:
+def made_up(points: int, count: int) -> Float[Tensor, "n m 3"]:
     """Noisy ellipsoids and boxes in the unit ball; every fourth one repeats some of its points."""
     rng = np.random.default_rng(0)
     clouds = rng.normal(size=(count, points, 3))

@@ -1,6 +1,7 @@
 """`qs3 predict`: clouds predicted in batches by several threads, and what is printed about them."""
 
 import contextlib
+import itertools
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -47,7 +48,8 @@ def predict_units(
         with contextlib.ExitStack() as using:
             for one in filter(None, (predictor, second)):
                 using.enter_context(use_trained(one.net, "target"))
-            for batch in _batches(units, batch_size, advance):
+            objects = _objects(units, advance)
+            while batch := list(itertools.islice(objects, batch_size)):
                 running.append(pool.submit(_predicted, predictor, second, batch, floor))
                 if len(running) > 2 * threads:
                     yield from running.popleft().result()
@@ -58,19 +60,10 @@ def predict_units(
         torch.set_num_threads(threads_before)  # libraries below torch keep one number for all
 
 
-def _batches(
-    units: Iterable[Unit], size: int, advance: Callable[[], None]
-) -> Iterator[list[Sample]]:
-    batch: list[Sample] = []
+def _objects(units: Iterable[Unit], advance: Callable[[], None]) -> Iterator[Sample]:
     for unit in units:
-        for item in unit():
-            batch.append(item)
-            if len(batch) == size:
-                yield batch
-                batch = []
+        yield from unit()
         advance()
-    if batch:
-        yield batch
 
 
 def _predicted(

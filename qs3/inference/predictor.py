@@ -114,10 +114,6 @@ class Predictor:
             floor: where the floor is along that axis, in metres: minus the camera's height where
                 the camera is the origin. Nets that see heights (`needs_floor`) need it; None:
                 as in their target, if that is a camera's (`camera_height`).
-
-        Raises:
-            DataError: no points, NaN or infinite coordinates, or not a cloud.
-            ConfigError: `floor` is needed, or is not in metres.
         """
         floor = self.floor(floor)
         stored = resample(_given(cloud, name), self.result.stored_points, up)
@@ -182,11 +178,9 @@ class Predictor:
         return self.probabilities(torch.stack([one.points for one in ready]), batch_size)
 
     def predict(self, samples: Sequence[Sample], floor: float | None = None) -> None:
-        """Fill in what the net makes of samples, in one batch; those that failed stay as they are.
+        """Fill in what the net makes of samples, in one batch; `floor` as in `prepare`.
 
-        Args:
-            samples: with clouds; one that cannot be used becomes one that failed.
-            floor: where the floor is in them, in metres, as in `prepare`.
+        One whose cloud cannot be used becomes one that failed.
         """
         ready: list[tuple[Sample, Tensor]] = []
         for one in samples:
@@ -318,9 +312,7 @@ def resample(
 def _given(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
     """The x y z of an array, tensor or nested list [n, >= 3] of numbers, as float32.
 
-    Raises:
-        DataError: something else, no points, NaN, infinite or masked coordinates; or several points
-            that are (0, 0, 0), which depth cameras write where they measured nothing.
+    Refuses several points that are (0, 0, 0): depth cameras write them where they measured nothing.
     """
     found = np.ma.asanyarray(cloud.detach().cpu() if isinstance(cloud, Tensor) else cloud)
     if found.ndim != 2 or found.shape[1] < 3 or found.dtype.kind not in "fiu":

@@ -85,10 +85,7 @@ def effects(table: Table) -> list[Compared]:
 
 
 def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
-    """The mean difference of pairs of cells, or why there is none.
-
-    The rows are taken as given: the interval is over seeds and clusters, as for one pair.
-    """
+    """The mean difference of pairs of cells, or why there is none."""
     cells = [cell for pair in pairs for cell in pair]
     seeds = sorted(set.intersection(*({*cell.runs.seeds} for cell in cells)))
     runs = pd.concat([cell.runs.finished for cell in cells])
@@ -133,10 +130,9 @@ def _difference(name: str, cells: Sequence[Cell], seeds: Sequence[int]) -> Compa
 
 
 def text(found: Sequence[Compared], base: str = "", table: Table | None = None) -> str:
-    """A line a row: differences in percentage points, and how many seeds would tell them apart.
+    """A line a row of `against` (with its `base`) or of `effects`: differences in points of %.
 
-    `found` is of `against` (with its `base`) or `effects`; of their `table` the title and what must
-    not be overlooked come first.
+    And how many seeds would tell them apart; of `table` the title and its marks come first.
     """
     tiers = any(len(one.subsets) > 1 for one in found)
     header = [f"minus {base}" if base else "difference", *["clouds"] * tiers]

@@ -42,11 +42,6 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
 
     Overrides are keys of the domain's config (`variant`, `published.folder`) or `paths.data_dir`;
     of a folder only `variant`.
-
-    Raises:
-        ConfigError: there is no such domain, or no such key.
-        MissingDataError: the domain's files are not there.
-        DataError: they are damaged.
     """
     if not is_finished(name) and (name in choices("domain") or not Path(name).exists()):
         domain = compose_domain(name, overrides)

@@ -43,7 +43,10 @@ def grid(table: Table) -> list[list[str]]:
         given = [cell for cell in cells if cell.entry.published]
         published = {head(cell.column, _ACCURACY): cell.entry.published for cell in given}
         ours = {
-            head(c.column, m): _ours(table, c, m) for c in cells if c.overrides for m in metrics
+            head(c.column, m): _marked(c.text(m), _is_other(table, c))
+            for c in cells
+            if c.overrides
+            for m in metrics
         }
         if ours and table.spec.averages:
             other = any(_is_other(table, cell) for cell in cells)
@@ -63,10 +66,6 @@ def grid(table: Table) -> list[list[str]]:
 
 def _unique(values: Iterable[Any]) -> list[Any]:
     return [value for value in dict.fromkeys(values) if value]
-
-
-def _ours(table: Table, cell: Cell, metric: str) -> str:
-    return _marked(cell.text(metric), _is_other(table, cell))
 
 
 def _marked(words: str, other: bool) -> str:

@@ -34,14 +34,10 @@ WITHIN = 0.1
 AZIMUTHS, RINGS = 12, 6
 """Directions are counted in 12 x 6 bins of equal solid angle."""
 
-_OUTLIER = 5.0  # a point is lonely if its 4th neighbour is so many times the cloud's median away
-_ODD_SIZE = 5.0  # an object's size is odd so many robust standard deviations from its class
-_USUAL = 8  # clouds of a class, to know what is usual: of three one is soon far from the others
 _COMPARED = 60  # clouds a class
 _SHEET, _ROW = 60, 6  # clouds of a class sheet, and in its rows
 _SIDE_PX, _POINTS = 376, 1024  # of a picture on a sheet
-_COLUMNS = ("sub", "tier", "sensor", "vertical")  # of an imported dataset's manifest
-_SPACED = ("nn_median", "nn_variation", "lonely", "directions", "below")
+_SPACED = ("nn_median", "nn_variation", "directions", "below")
 
 
 def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
@@ -53,7 +49,6 @@ def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
         copies: share of points that repeat an earlier one exactly; left out of all below.
         nn_median: median distance to the nearest other point, in the unit ball.
         nn_variation: the distances' standard deviation over their mean.
-        lonely: share of points whose 4th neighbour is over five times as far as the median's.
         directions: share of 72 equal bins of direction, from the centroid, with a point in it.
         below: the same for the lowest third of the bins (what a scan from above misses).
     """
@@ -67,12 +62,11 @@ def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
         "radius": float(np.linalg.norm(cloud - centroid, axis=1).max()),
         "copies": 1 - len(distinct) / len(cloud),
     }
-    if len(distinct) < 5:
+    if len(distinct) < 2:
         return {**found, **dict.fromkeys(_SPACED, 0.0)}
     ball = unit_ball(distinct)
-    nearest, fourth = cKDTree(ball).query(ball, k=[2, 5])[0].T
-    lonely = fourth > _OUTLIER * np.median(fourth)
-    spaced = (np.median(nearest), nearest.std() / nearest.mean(), lonely.mean(), *coverage(ball))
+    nearest = cKDTree(ball).query(ball, 2)[0][:, 1]
+    spaced = (np.median(nearest), nearest.std() / nearest.mean(), *coverage(ball))
     return found | dict(zip(_SPACED, map(float, spaced), strict=True))
 
 
@@ -99,17 +93,6 @@ def measured(opened: Opened, sample: int, seed: int = 0) -> pd.DataFrame:
             rows.append(known | one_cloud(data.points[i]))
             advance()
     return pd.DataFrame(rows)
-
-
-def odd_sizes(clouds: pd.DataFrame) -> list[str]:
-    """Ids of clouds far larger or smaller than others of their class, the oddest first."""
-    logs = np.log(clouds["largest"].clip(lower=1e-12))
-    by_class = logs.groupby(clouds["class"])
-    off = (logs - by_class.transform("median")).abs()
-    spread = (1.4826 * off.groupby(clouds["class"]).transform("median")).clip(lower=0.02)
-    far = (off / spread)[by_class.transform("size") >= _USUAL]
-    odd = far[far > _ODD_SIZE].sort_values(ascending=False)
-    return list(clouds["id"][odd.index])
 
 
 def copies(data: PointSet, rows: Sequence[ManifestRow]) -> dict[str, Any]:
@@ -142,38 +125,30 @@ def copies(data: PointSet, rows: Sequence[ManifestRow]) -> dict[str, Any]:
 
 def domain_text(opened: Opened, clouds: pd.DataFrame) -> str:
     """Text about one dataset and its `measured` clouds."""
-    data, kept = opened.data, opened.kept
+    data = opened.data
     counts = pd.DataFrame(data.counts()).reindex(data.classes).fillna(0).astype(int)
     counts.loc["unlabelled"] = [(data.labels[data.indices(s)] < 0).sum() for s in counts]
     counts["all"] = counts.sum(axis=1)
     counts = counts[counts["all"] > 0]
     counts.loc["all"] = counts.sum()
-    tables = []
-    for column in _COLUMNS:
-        found = [(row.cls, row.more[column]) for row in kept if row.more.get(column)]
-        if found:
-            frame = pd.DataFrame(found, columns=["class", column])
-            tables.append(frame.value_counts(sort=False).unstack(fill_value=0).to_string())
-    points = pd.Series([row.valid_points for row in kept if row.valid_points is not None])
+    points = pd.Series([row.valid_points for row in opened.kept if row.valid_points is not None])
     known = f"{points.median():.0f} (median), at least {points.min()}" if len(points) else ""
     few = int((points < data.points.shape[1]).sum())
     return render(
         "inspection.txt",
         opened=opened,
         counts=counts.to_string(),
-        columns=tables,
         points=known + (f"; {few} clouds have too few: some are repeated" if few else ""),
         left_out=Counter(row.status for row in opened.rows if row.status != "ok"),
         unit_ball=((clouds["radius"] - 1).abs() < 1e-3).mean() > 0.99,
         clouds=clouds,
         shapes=_shapes(clouds).to_string(),
-        odd=odd_sizes(clouds),
         same=copies(data, opened.rows),
     )
 
 
 def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
-    """Medians by class and of all, as text; means of what is mostly 0."""
+    """Medians by class and of all, as text."""
     rows = {}
     for cls, of in [*clouds.groupby("class"), ("all", clouds)]:
         m = of.median(numeric_only=True)
@@ -184,17 +159,12 @@ def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
             "cv": f"{m['nn_variation']:.2f}",
             "seen": f"{m['directions']:.0%}",
             "below": f"{m['below']:.0%}",
-            "lonely": f"{of['lonely'].mean():.2%}",
         }
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
 def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
-    """The gap between two datasets, by up to 60 clouds a class, drawn with `seed`.
-
-    Raises:
-        ConfigError: they have no class in common.
-    """
+    """The gap between two datasets, by up to 60 clouds a class, drawn with `seed`."""
     both = (a, b)
     common = [c for c in a.data.classes if all(len(one.data.members(c)) for one in both)]
     if not common:
@@ -216,8 +186,8 @@ def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
             few = farthest_point_sampling_np(ball, count) if len(ball) > count else slice(None)
             seen.append(one_cloud(ball[few]))
         table = pd.DataFrame(seen)
-        means = table[["copies", "lonely"]].mean()
-        clouds.append(table.median().to_dict() | means.to_dict() | surface(one, positions))
+        repeated = {"copies": float(table["copies"].mean())}  # mostly 0, as its median is
+        clouds.append(table.median().to_dict() | repeated | surface(one, positions))
     return {
         "a": a.label,
         "b": b.label,
@@ -255,7 +225,6 @@ _GLANCE = {
     "directions": ("directions seen", "{:.0%}"),
     "below": ("of the lowest third", "{:.0%}"),
     "copies": ("repeated points", "{:.2%}"),
-    "lonely": ("lonely points", "{:.2%}"),
     "off": ("off the clean twin, median", "{:.4f}"),
     "off_95": ("off the clean twin, 95 %", "{:.4f}"),
     "measured": ("clean twin measured", "{:.0%}"),

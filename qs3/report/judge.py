@@ -30,11 +30,7 @@ BLOCK = 30
 
 @dataclass(frozen=True)
 class Family:
-    """Runs of one config that saw the same data: result files by seed, -1 where it is not known.
-
-    `name` is experiment and hash, or the classifier's that comes with qs3, or the run's path;
-    `data` what both domains are made of, "" where that is not known.
-    """
+    """Runs of one config that saw the same data (see `_families`): result files by seed, or -1."""
 
     name: str
     data: str = ""
@@ -48,11 +44,9 @@ class Family:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was judged, and the figures of it.
+    """What was judged, in words, and the figures of it.
 
     Attributes:
-        about: the archive, its part, and what was left out, in words.
-        classes: that were judged.
         figures: a row a family and tier ("all", "clean" or "hard"), shares in [0, 1]:
             run, seeds, tier, objects, blocks (of frames they come from);
             accuracy, balanced (over the classes that are there), accuracy_more and balanced_more
@@ -78,17 +72,12 @@ def judge(
 ) -> Verdict:
     """Judge saved runs on an archive's objects of the classes that every run knows.
 
-    Points that the archive marks as stray are left out.
-
     Args:
         runs: folders of runs, folders of such folders, or result files.
-        data: the .npz.
+        data: the .npz; points that it marks as stray are left out.
         part: of its `dev`; none: "judge", where it has one, else all.
         floor: z of the floor in the archive, minus its camera's height, for nets that know heights.
         device: of the nets.
-
-    Raises:
-        ConfigError: nothing is left to judge on, or runs cannot be judged so.
     """
     archive = read_archive(data)
     part = part or (JUDGE if JUDGE in archive.parts else "")

@@ -99,10 +99,6 @@ def scan_object(
         overrides: of generate.py, such as ["domain=specklenet10", "renderer=mitsuba"].
         object_id: which object; None: a chair, or the first there is.
         mesh: a mesh file to scan in place of the domain's objects.
-
-    Raises:
-        ConfigError: a setting is wrong, or there is no such object.
-        MeshError, RenderError, DataError: it cannot be scanned.
     """
     from qs3.config.compose import composed
     from qs3.config.hydra import build

@@ -66,12 +66,7 @@ MESHES, BLOCKS, ROOMS, CLOUDS = "meshes", "blocks of frames", "rooms", "clouds"
 
 
 def record(metrics: RunMetrics, take: str) -> dict[str, Any]:
-    """A line of the frame, without its place and predictions.
-
-    Args:
-        metrics: of a finished run.
-        take: "final", or "warmup" for the scores of the teacher of round 0.
-    """
+    """A line of the frame without its place and predictions; of take "warmup" the teacher's."""
     final, made_of, rules = take == "final", metrics.made_of, metrics.selection
     tiers = (metrics.evaluation.tiers or {}) if final else {}
     scores = {"": metrics.final if final else metrics.warmup.selected.scores}
@@ -103,10 +98,7 @@ def record(metrics: RunMetrics, take: str) -> dict[str, Any]:
 
 
 def load_runs(log_dir: str | Path) -> dict[tuple[str, str, str], pd.DataFrame]:
-    """All runs below a folder by experiment, hash and take, unfinished and damaged ones included.
-
-    These have a `problem` and no scores.
-    """
+    """All runs below a folder by experiment, hash and take; a `problem` if one is unfinished."""
     root = Path(log_dir)
     folders = {path.parent for path in root.rglob(METRICS)}
     folders |= {p for p in root.rglob("seed*-*") if p.is_dir() and _FOLDER.fullmatch(p.name)}
@@ -139,12 +131,7 @@ def write_kept(path: Path, lines: pd.DataFrame) -> None:
 
 
 def read_kept(path: str | Path, target: str | None = None) -> dict[tuple[str, str], pd.DataFrame]:
-    """Read a kept file: the lines of each row and column; only those on a target if one is given.
-
-    Raises:
-        ConfigError: there is no such file.
-        DataError: it cannot be read, or is not one.
-    """
+    """Read a kept file: the lines of each row and column; only those on a target if it is given."""
     numbers: dict[str, type] = {**dict.fromkeys((*SCORES, *_COSTS), float), "seed": int}
     try:
         lines = pd.read_csv(
@@ -184,11 +171,7 @@ class Answers:
 
 
 def answers_of(run: Mapping[str, Any]) -> Answers:
-    """Of a line of the frame, or of the predictions in its folder.
-
-    Raises:
-        DataError: there are none, or they are damaged.
-    """
+    """Of a line of the frame, or of the predictions in its folder."""
     if run.get("called"):
         labels, called, clusters = (
             np.array(run[key].split(), dtype=int) for key in ("labels", "called", "clusters")
@@ -230,11 +213,9 @@ class Stat:
 
 
 class Runs:
-    """The runs of one config, and what must not be averaged.
+    """The runs of one config; those that saw different datasets have no mean.
 
-    A failed or unfinished seed is shown and never averaged over silently; runs that saw different
-    datasets have no mean at all. Datasets of one recipe, made by machines that round in other ways,
-    are one dataset.
+    Datasets of one recipe, made by machines that round in other ways, are one dataset.
     """
 
     def __init__(self, lines: pd.DataFrame) -> None:
@@ -293,11 +274,7 @@ def data_lines(lines: pd.DataFrame) -> list[str]:
 
 
 def summarise(folders: Sequence[Path], settings: Mapping[Path, str] | None = None) -> str:
-    """An aligned text table of the runs in `folders`, a line a config; percentages.
-
-    What could not be averaged follows below it. `settings`: by folder how a config differs from
-    the others.
-    """
+    """A text table of the runs in `folders`, a line a config, with how it differs (`settings`)."""
     differing = [(settings or {}).get(folder, "") for folder in folders]
     lines = pd.DataFrame([next(load_run(folder)) for folder in folders]).assign(settings=differing)
     rows, notes = [], []

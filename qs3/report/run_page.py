@@ -84,12 +84,7 @@ def is_run(folder: Path) -> bool:
 
 
 def read_run(folder: str | Path) -> RunFiles:
-    """Read a run's folder.
-
-    Raises:
-        MissingDataError: it is not a run's folder.
-        DataError: one of its files is damaged.
-    """
+    """Read a run's folder."""
     import pandas as pd
     import yaml
     from omegaconf import OmegaConf
@@ -133,12 +128,7 @@ def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> D
 
 
 def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) -> PointSet:
-    """A domain's dataset, if it is the one that the run used. Nothing is imported or made.
-
-    Raises:
-        MissingDataError: the run is not finished; the dataset is not there, or is another.
-        DataError: it is damaged.
-    """
+    """A domain's dataset, if it is the one that the run used. Nothing is imported or made."""
     domain = domain_of(run, role, data_dir)
     if run.metrics is None or not is_finished(domain.folder):
         raise MissingDataError(f"the run's {role}, {domain.name}, is not at {domain.folder}")
@@ -176,9 +166,6 @@ def draw(
         embed: also show the features of both domains; takes a minute.
         config: of the run; None: what Hydra wrote into its folder.
         packages: where a net of one's own is defined, beside those of qs3; the code there is run.
-
-    Raises:
-        MissingDataError, DataError: see `read_run`.
     """
     from omegaconf import OmegaConf
 
@@ -290,9 +277,6 @@ def worst_clouds(
 
     First the errors, the most confident before the others; then all else, the least confident
     first. `data_dir`: where the datasets lie; None: where the run's config says.
-
-    Raises:
-        MissingDataError: the run's target is not there, or there are no predictions.
     """
     p, m = run.predictions, run.metrics
     if p is None or m is None:
@@ -324,13 +308,9 @@ def worst_clouds(
 
 @dataclass(frozen=True)
 class AfterTraining:
-    """Draws a finished run's pictures, and logs them to wandb's active run, if there is one.
+    """Draws a finished run's pictures ("auto": not in a sweep), also for wandb's active run.
 
     A picture that cannot be made is a warning: the result is saved already.
-
-    Attributes:
-        pictures: False draws nothing, "auto" nothing in a sweep: they would take as long as many a
-            run.
     """
 
     pictures: bool | Literal["auto"] = "auto"

@@ -52,10 +52,7 @@ class Job(NamedTuple):
 
 
 def missing(table: Table, seeds: Sequence[int] = (), rows: Sequence[str] = ()) -> list[Job]:
-    """What is to be run: row by row, in each row seed by seed; what cells share, once.
-
-    Cells whose file says `first: true` come before the others: long runs that would otherwise be
-    left alone at the end of several at a time.
+    """What is to be run, cell by cell (those with `first: true` before the others); each job once.
 
     Args:
         seeds: that each cell should have; none: those that the table wants.
@@ -83,13 +80,8 @@ def launch(
 ) -> int:
     """Run jobs, in order, as one multirun of `train.py`; returns its exit status.
 
-    What becomes of them is written to the terminal by the multirun itself, with the failures last;
-    with submitit, what a job prints lies in `<log_dir>/.submitit`.
-
-    Args:
-        launcher: one of `LAUNCHERS`.
-        at_once: how many run at the same time; None: what the launcher does by itself.
-        settings: further overrides of the launcher, such as "hydra.launcher.partition=gpu".
+    With one of `LAUNCHERS`, `at_once` at the same time (None: what it does by itself), and further
+    overrides of it. With submitit, what a job prints lies in `<log_dir>/.submitit`.
     """
     if not jobs:
         return 0
@@ -113,13 +105,9 @@ def launch(
 def own_row(
     file: Path, name: str | None, selftraining: str, settings: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """The row of a method's file, as one in the table's file.
+    """The row of a method's file, as one in the table's file; it names the file's SHA-256.
 
-    Args:
-        file: of the method; its SHA-256 is in the row's command, so the runs are of this content.
-        name: of the row; None: the file's.
-        selftraining: of conf/selftraining; "none".
-        settings: of the class, such as "method.weight=0.5".
+    `settings` are of the class, such as "method.weight=0.5".
     """
     words = [
         *(ALONE, "method=own", override("method.file", file)),
@@ -136,12 +124,7 @@ def own_row(
 
 
 def check_row(table: Table, name: str) -> None:
-    """Check that all rows follow the leaderboard's rules, and that the file is a method.
-
-    Raises:
-        ConfigError: a row is of another experiment, or the file is not a method
-            (`qs3.methods.own`).
-    """
+    """Check that all rows follow the leaderboard's rules, and the file (`qs3.methods.own`)."""
     for row, cells in table.rows.items():
         if row != name and any(c.overrides and ALONE not in c.overrides for c in cells):
             raise ConfigError(

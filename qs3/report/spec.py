@@ -108,9 +108,6 @@ def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[s
     """A table's name and content, with further rows as in the file.
 
     `name` is of a file in conf/table, or the path of one's own, NAME.yaml.
-
-    Raises:
-        ConfigError: there is no such table, or an entry is wrong.
     """
     path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
     try:
@@ -170,9 +167,6 @@ def chosen(names: Iterable[str], words: Sequence[str]) -> list[str]:
     """Names that are meant by the words: the one that is the word, else all that contain it.
 
     Case and spaces do not count, and an arrow may be typed as "->". No words mean all names.
-
-    Raises:
-        ConfigError: a word means no name.
     """
     plain = {name: re.sub(r"\s", "", name.lower().replace("→", "->")) for name in names}
     meant: set[str] = set() if words else {*plain}

@@ -37,14 +37,8 @@ INCOMPLETE = "†"
 class Cell:
     """One number of a table.
 
-    Attributes:
-        row, column: its place.
-        entry: of the table's file; empty where that says nothing.
-        overrides: of train.py, without the seed; empty if there is only a published number.
-        seeds: that it should have.
-        runs: ours, finished or not.
-        target: name of the target domain; "" if it is not known.
-        simulated: whether that target is simulated.
+    `overrides` are those of train.py without the seed, empty if there is only a published number;
+    `seeds` those that it should have; `runs` ours, finished or not; `target` is "" if not known.
     """
 
     row: str
@@ -78,8 +72,7 @@ class Cell:
 class Table:
     """A filled table: cells by row name, in the order of `columns`.
 
-    `file_name` is of its own files, with the target and the columns that were asked for; `title`
-    and `notes` stand above and below it.
+    `file_name` has the target and the columns that were asked for.
     """
 
     name: str
@@ -146,9 +139,6 @@ def build_table(
         rows: further ones, as in the file.
         columns: only these (`spec.chosen`), and those that are published alone.
         runs: look for them.
-
-    Raises:
-        ConfigError: no such table, or its file, an override, a column or the target is wrong.
     """
     name, spec = read_spec(name, rows)
     wanted = chosen(spec.columns, columns)

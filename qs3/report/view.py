@@ -33,11 +33,7 @@ class Wanted(NamedTuple):
 def view(
     paths: Sequence[str], clouds: int, colour: str, wanted: Wanted
 ) -> tuple[str, list[str], list[str]]:
-    """The page, what is on it, and what could not be read, a line each.
-
-    Raises:
-        MissingDataError, DataError: nothing can be shown at all.
-    """
+    """The page, what is on it, and what could not be read, a line each."""
     share = max(1, clouds // len(paths))
     parts = [_part(path, share, wanted) for path in paths]
     title = ", ".join(Path(path).absolute().name for path in paths)

@@ -23,11 +23,7 @@ LAST = "last.ckpt"
 
 
 def save(value: Any, path: str | os.PathLike[str]) -> None:
-    """Save tensors and plain values to `path`, atomically.
-
-    Raises:
-        ConfigError: there is another value among them, such as numpy's: `load` would refuse it.
-    """
+    """Save tensors and plain values to `path`, atomically; others, such as numpy's, are refused."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         try:
             torch.save(value, file)
@@ -46,11 +42,7 @@ def save(value: Any, path: str | os.PathLike[str]) -> None:
 def load(
     path: str | os.PathLike[str], device: Any = "cpu", advice: str = "start again with force=true"
 ) -> Any:
-    """Read what `save` wrote; the disk is read once.
-
-    Raises:
-        DataError: the file is missing or damaged; ends with the advice.
-    """
+    """Read what `save` wrote; the disk is read once. A DataError ends with the advice."""
     with _intact(path, advice) as file:
         return torch.load(file, map_location=device, weights_only=True)
 

@@ -22,20 +22,18 @@ written last, and atomically: it is the mark of a finished run.
 import contextlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.errors import ConfigError, DataError
 from qs3.runs.metrics import METRICS
 from qs3.utils.files import write_json
-from qs3.utils.locks import owned
 
 STARTED = "started.json"
 _ANEW = "choose another experiment_name, or start again with force=true"
 
 _KEPT_WHEN_CLEARED = (".hydra", ".lock")
-_OF_A_START = ("train.log", ".lock", STARTED, ".hydra")
 
 
 def read_started(folder: str | Path) -> dict[str, Any] | None:
@@ -91,19 +89,3 @@ def clear(folder: str | Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink()
-
-
-@contextlib.contextmanager
-def removed_if_unbegun(folder: Path) -> Iterator[None]:
-    """After an error of ours in the block, remove a folder that holds nothing but its start.
-
-    Hydra makes the folder before anything is checked.
-    """
-    try:
-        yield
-    except Qs3Error:
-        with contextlib.suppress(Qs3Error, OSError), owned(folder):  # another process may train
-            if {path.name for path in folder.iterdir()} <= {*_OF_A_START}:
-                shutil.rmtree(folder)
-                folder.parent.rmdir()  # if nothing else is in it
-        raise

@@ -272,11 +272,7 @@ _SCHEMA: TypeAdapter[RunMetrics] = TypeAdapter(RunMetrics)
 
 
 def read_metrics(folder: str | Path) -> RunMetrics | None:
-    """The result of a finished run; None if the run is not finished.
-
-    Raises:
-        DataError: the file is damaged; names the first key that is wrong.
-    """
+    """The result of a finished run; None if the run is not finished."""
     path = Path(folder) / METRICS
     try:
         return _SCHEMA.validate_json(path.read_bytes())

@@ -60,9 +60,7 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
     p, names = predictions, np.array([*predictions.classes, ""], dtype=object)
     columns = {"id": p.ids, "mesh": p.meshes, "label": names[p.labels]}
     columns |= {"predicted": names[p.predicted], **({"tier": p.tiers} if p.tiers else {})}
-    _write(
-        path, columns | {f"p_{c}": of for c, of in zip(p.classes, p.probabilities.T, strict=True)}
-    )
+    _write(path, columns | _chances(p.classes, p.probabilities))
 
 
 def write_predictions_of_files(
@@ -87,11 +85,7 @@ def write_predictions_of_files(
 
 
 def read_predictions(path: Path) -> Predictions:
-    """Read the table.
-
-    Raises:
-        DataError: it is not there, or damaged.
-    """
+    """Read the table; it is checked as a whole."""
     with _named(path):
         table = _read(path)
         chances = table.filter(regex="^p_")
@@ -130,11 +124,7 @@ def write_pseudo_labels(
 
 
 def read_pseudo_labels(path: Path) -> pd.DataFrame:
-    """Read the table: id, label (the predicted class's name), confidence, selected (a bool).
-
-    Raises:
-        DataError: it is not there, or damaged.
-    """
+    """Read the table: id, label (the predicted class's name), confidence, selected (a bool)."""
     with _named(path):
         table = _read(path)
         kept = [{"0": False, "1": True}[word] for word in table.selected]

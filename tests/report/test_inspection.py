@@ -31,14 +31,13 @@ def test_an_even_grid_has_one_spacing():
     assert (of["x"], of["y"], of["z"], of["largest"], of["floor"]) == (7, 7, 0, 7, 0)
     assert of["nn_median"] == pytest.approx(1 / radius)
     assert of["nn_variation"] == pytest.approx(0, abs=1e-5)
-    assert of["copies"] == of["lonely"] == 0
+    assert of["copies"] == 0
     assert of["radius"] == of["off_centre"] == pytest.approx(radius)
 
 
-def test_copies_and_lonely_points():
+def test_copies():
     of = inspection.one_cloud(np.concatenate([grid(), grid()[:16], [[100, 0, 0]]]))
     assert of["copies"] == pytest.approx(16 / 81)
-    assert of["lonely"] == pytest.approx(1 / 65)
     assert inspection.one_cloud(np.zeros((10, 3)))["copies"] == pytest.approx(0.9)
 
 
@@ -76,18 +75,6 @@ def test_a_cloud_in_train_and_test_is_a_leak(tmp_path):
     opened = open_named(str(tmp_path / "s"), {})
     text = inspection.domain_text(opened, inspection.measured(opened, 9))
     assert "WARNING: 1 clouds in the test split and in another one, too" in text
-
-
-def test_a_size_is_odd_beside_many_alike(tmp_path):
-    """Of three clouds none is: two that happen to be alike say nothing of the third."""
-    rng = np.random.default_rng(0)
-    sizes = np.array([1, 1.01, 1.3, *rng.uniform(0.9, 1.1, 8), 1000])
-    clouds = (rng.uniform(-1, 1, (12, 64, 3)) * sizes[:, None, None]).astype(np.float32)
-    for count, odd in ((3, []), (12, ["a/11"])):
-        ids = [f"a/{i}" for i in range(count)]
-        store(tmp_path / str(count), clouds[:count], ids, ["train"] * count)
-        opened = open_named(str(tmp_path / str(count)), {})
-        assert inspection.odd_sizes(inspection.measured(opened, 99)) == odd
 
 
 def test_a_sample_is_drawn_and_always_the_same(tmp_path):
