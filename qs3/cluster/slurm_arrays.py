@@ -14,7 +14,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
@@ -68,7 +68,20 @@ class SlurmArrays:
 
     def run(self, make_worker: Maker[Task, Result], tasks: Tasks[Task]) -> Outcomes[Result]:
         """Do the tasks; as `qs3.utils.pool.Processes.run`."""
-        executor = self._executor()
+        import submitit
+
+        folder = Path(self.folder).absolute()
+        executor = submitit.AutoExecutor(folder=folder, cluster=self.cluster)
+        executor.update_parameters(
+            name="qs3",
+            timeout_min=self.time_limit_min,
+            cpus_per_task=self.cpus,
+            mem_gb=self.memory_gb,
+            slurm_array_parallelism=self.jobs,
+            slurm_partition=self.partition,
+            slurm_setup=list(self.setup) or None,
+        )
+        folder.mkdir(parents=True, exist_ok=True)
         waiting = iter(tasks)
         again: list[tuple[str, Any]] = []
         deaths: Counter[str] = Counter()
@@ -82,7 +95,13 @@ class SlurmArrays:
                     if not chunk:
                         break
                     chunks.append(chunk)
-                running += self._submit(executor, make_worker, chunks)
+                jobs = []
+                with executor.batch() if chunks else nullcontext():
+                    for chunk in chunks:
+                        journal = folder / f"journal-{os.urandom(8).hex()}"
+                        handle = executor.submit(_do_chunk, make_worker, chunk, journal)
+                        jobs.append(_Job(handle, chunk, journal))
+                running += jobs
                 if not running:
                     return
                 for job in list(running):
@@ -104,36 +123,6 @@ class SlurmArrays:
                     time.sleep(self.poll_s)
         finally:
             _cancel(running, wait_s=_STOP_S if self.cluster == "local" else 0)
-
-    def _executor(self) -> Any:
-        import submitit
-
-        executor = submitit.AutoExecutor(folder=Path(self.folder).absolute(), cluster=self.cluster)
-        executor.update_parameters(
-            name="qs3",
-            timeout_min=self.time_limit_min,
-            cpus_per_task=self.cpus,
-            mem_gb=self.memory_gb,
-            slurm_array_parallelism=self.jobs,
-            slurm_partition=self.partition,
-            slurm_setup=list(self.setup) or None,
-        )
-        return executor
-
-    def _submit(
-        self, executor: Any, make_worker: Callable[[], Any], chunks: list[list[tuple[str, Any]]]
-    ) -> list[_Job]:
-        if not chunks:
-            return []
-        folder = Path(self.folder).absolute()
-        folder.mkdir(parents=True, exist_ok=True)
-        jobs = []
-        with executor.batch():
-            for chunk in chunks:
-                journal = folder / f"journal-{os.urandom(8).hex()}"
-                handle = executor.submit(_do_chunk, make_worker, chunk, journal)
-                jobs.append(_Job(handle, chunk, journal))
-        return jobs
 
 
 @dataclass

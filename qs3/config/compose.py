@@ -52,17 +52,13 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
         try:
             return compose(command, list(overrides), **more)
         except HydraException as error:
-            raise ConfigError(f"{place}{first_line(error)}") from error
+            line = str(error).strip().partition("\n")[0]
+            raise ConfigError(f"{place}{line}") from error
 
 
 def choices(group: str) -> list[str]:
     """Names of the files of a config group, sorted: `choices("domain")`."""
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-
-
-def first_line(error: BaseException) -> str:
-    """The first line of an error's message; its kind if it has none."""
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def override(key: str, value: str | Path) -> str:

@@ -59,7 +59,7 @@ def config_sha256(cfg: DictConfig) -> str:
         _leave_out(plain, key)
     plain.setdefault("callbacks", {})  # ~callbacks leaves nothing out
     plain = _with_values(plain, cfg, "", _FROM_OUTSIDE)
-    if _without_rounds(plain.get("selftraining")):  # its other settings are not read
+    if not has_rounds(plain.get("selftraining")):  # its other settings are not read
         plain["selftraining"] = None
         plain = _with_values(plain, cfg, "", _from(["selftraining"]))
     trainer = plain.get("trainer")
@@ -116,9 +116,11 @@ def config_hash(cfg: DictConfig) -> str:
     return config_sha256(cfg)[:8]
 
 
-def has_rounds(cfg: DictConfig) -> bool:
-    """Whether the config has self-training that does something."""
-    return not _without_rounds(OmegaConf.to_container(cfg.selftraining, resolve=False))
+def has_rounds(selftraining: Any) -> bool:
+    """Whether a group `selftraining`, as nested dicts, does something."""
+    if not isinstance(selftraining, dict):
+        return False
+    return selftraining.get("_target_") != _NO_ROUNDS and selftraining.get("rounds") != 0
 
 
 def run_name(cfg: DictConfig) -> str:
@@ -129,9 +131,3 @@ def run_name(cfg: DictConfig) -> str:
 def run_folder(cfg: DictConfig) -> Path:
     """The folder of the run that `cfg` describes, whether it exists or not."""
     return Path(cfg.paths.log_dir).resolve() / run_name(cfg)
-
-
-def _without_rounds(selftraining: Any) -> bool:
-    if not isinstance(selftraining, dict):
-        return True
-    return selftraining.get("_target_") == _NO_ROUNDS or selftraining.get("rounds") == 0

@@ -35,11 +35,7 @@ def _tags(*, _root_: DictConfig) -> ListConfig:
 
 
 def _gpu_in_turn(gpus: int | None = None) -> int:
-    """The GPU for this job: its number in the sweep, modulo `gpus`; 0 outside of a sweep.
-
-    `gpus` is how many there are; None: as many as CUDA finds. (CUDA_VISIBLE_DEVICES would come too
-    late in a process that has run a job before.)
-    """
+    """The GPU for this job: its number in the sweep, modulo `gpus` (None: all that CUDA finds)."""
     if not in_multirun():
         return 0
     if gpus is None:
@@ -60,7 +56,9 @@ def component_names(cfg: DictConfig) -> dict[str, str]:
     }
     if file := cfg.method.get("file"):  # method=own
         names["method"] = Path(file).stem
-    return names if hashing.has_rounds(cfg) else {**names, "selftraining": "none"}
+    if not hashing.has_rounds(OmegaConf.to_container(cfg.selftraining, resolve=False)):
+        names["selftraining"] = "none"
+    return names
 
 
 def _sha256(file: str | None) -> str:
@@ -78,10 +76,7 @@ def _choices(group: str, indent: int = 0) -> str:
 
 
 def _described(group: str, also: str = "") -> str:
-    """A line for each choice of a config group: its name and the first sentence of its file.
-
-    With `also` only the choices that another group has, too.
-    """
+    """A line for each choice, of both groups if two are given, with its file's first sentence."""
     both = {path.name for path in _files(also or group)}
     files = [path for path in _files(group) if path.name in both]
     width = max((len(path.stem) for path in files), default=0)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 from lightning.pytorch import LightningDataModule
-from torch import Generator, Tensor
+from torch import Tensor
 
 from qs3.datamodules.augment import Augment, augmented
-from qs3.datamodules.batches import Batches, Piece, generator_of
+from qs3.datamodules.batches import Batches, Piece
 from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
@@ -119,7 +119,7 @@ class AdaptationData(LightningDataModule):
             part.setup("fit")
 
     def set_pseudo_labels(self, index: Tensor, labels: Tensor) -> None:
-        """What the next round trains on: positions in `target` [m], and their labels [m]."""
+        """Set `pseudo` for the next round."""
         self.pseudo = (index, labels)
 
     def train_dataloader(self) -> Batches:
@@ -173,12 +173,9 @@ class AdaptationData(LightningDataModule):
         rank, result = self.trainer.global_rank, dict(batch)
         for name, part in batch.items():
             if isinstance(part, dict):
-                device = part["points"].device
-
-                def generator(use: str, name: str = name, device: Any = device) -> Generator:
-                    return generator_of(batch, f"{name} {use}".strip(), self.seed, rank, device)
-
-                result[name] = augmented(self.augment, part, generator, self.scale)
+                result[name] = augmented(
+                    self.augment, part, batch, name, self.seed, rank, self.scale
+                )
         return result
 
     def state_dict(self) -> dict[str, Any]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge, Interval
 from jaxtyping import Float
 from torch import Tensor
 
+from qs3.datamodules.batches import generator_of
 from qs3.utils.settings import settings
+
+Moves = Callable[[Float[Tensor, "b n 3"]], Float[Tensor, "b n 3"]]
+"""Turns, scales, shifts and lifts each of B clouds as a whole."""
 
 REGION_SHARE = (0.1, 0.25)
 """The smallest and largest share of a cloud's points that a dropped region takes."""
@@ -51,33 +54,21 @@ class Augment:
         points: Float[Tensor, "b n 3"],
         generator: torch.Generator,
         scale: str = "unit_ball",
-    ) -> Float[Tensor, "b n 3"]:
-        """A new batch; the one given is left alone.
+        moves: Moves | None = None,
+    ) -> tuple[Float[Tensor, "b n 3"], Moves]:
+        """A new batch, and how its clouds were moved; cut, holes and jitter are its own.
 
         Args:
             points: clouds as `scale` says.
             generator: on the device of `points`.
             scale: see `qs3.datamodules.clouds`; they are so again after a cut.
-        """
-        return self.with_moves(points, generator, scale)[0]
-
-    def with_moves(
-        self,
-        points: Float[Tensor, "b n 3"],
-        generator: torch.Generator,
-        scale: str,
-        moves: Moves | None = None,
-    ) -> tuple[Float[Tensor, "b n 3"], Moves]:
-        """The same, and how clouds were moved; or moved as given, as others of the same objects.
-
-        Cut, holes and jitter are these clouds' own in any case.
+            moves: those of other clouds of the same objects; None draws new ones.
         """
         if self.crop < 1.0:
             points = crop(points, self.crop, generator, scale)
         if self.drop_regions:
             points = drop_regions(points, self.drop_regions, generator)
-        if moves is None:
-            moves = self._drawn_moves(points, generator, scale)
+        moves = moves or self._drawn_moves(points, generator, scale)
         points = moves(points)
         if self.jitter_sigma > 0.0:
             noise = torch.randn(points.shape, generator=generator, device=points.device)
@@ -91,69 +82,52 @@ class Augment:
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
 
-        angle = factor = shift = None
+        angle = factor = None
+        added: list[Tensor] = []
         if self.rotate_z:
             angle = 2 * math.pi * uniform(b)
         if self.scale > 1.0:
             low, high = 1 / self.scale, self.scale
             factor = low + (high - low) * uniform(b, 1, 3)
         if self.shift > 0.0:
-            shift = self.shift * (2 * uniform(b, 1, 3) - 1)
-        lift = None
+            added.append(self.shift * (2 * uniform(b, 1, 3) - 1))
         if self.lift > 0.0 and scale == "above_floor":
             up = torch.arange(3, device=points.device).eq(2).to(points.dtype) * self.lift
-            lift = up * (2 * uniform(b, 1, 1) - 1)
-        return Moves(angle, factor, shift, lift)
+            added.append(up * (2 * uniform(b, 1, 1) - 1))
 
-
-@dataclass(frozen=True, eq=False)
-class Moves:
-    """How each of B clouds is moved as a whole, in this order; None: not at all.
-
-    Attributes:
-        angle: [B] about z, in radians.
-        factor: [B, 1, 3] of each axis.
-        shift, lift: [B, 1, 3] that are added.
-    """
-
-    angle: Tensor | None
-    factor: Tensor | None
-    shift: Tensor | None
-    lift: Tensor | None
-
-    def __call__(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
-        """The clouds, moved."""
-        if self.angle is not None:
-            points = rotate_z(points, self.angle)
-        if self.factor is not None:
-            points = points * self.factor
-        for way in (self.shift, self.lift):
-            if way is not None:
+        def moves(points: Tensor) -> Tensor:
+            if angle is not None:
+                points = rotate_z(points, angle)
+            if factor is not None:
+                points = points * factor
+            for way in added:
                 points = points + way
-        return points
+            return points
+
+        return moves
 
 
 def augmented(
     augment: Augment,
     part: Mapping[str, Tensor],
-    generator: Callable[[str], torch.Generator],
+    step: Mapping[str, Any],
+    name: str,
+    seed: int,
+    rank: int,
     scale: str,
 ) -> dict[str, Tensor]:
-    """A domain's part of a batch with its clouds augmented.
+    """A domain's `part` of a batch, with "points", perhaps "again", and labels, augmented.
 
     A second draw ("again") is turned, scaled, shifted and lifted as the first: both show one object
-    in one place. Cuts, holes and jitter are each one's own.
-
-    Args:
-        augment: of all clouds.
-        part: "points", perhaps "again", and labels.
-        generator: of a use, on the clouds' device: "" for the clouds themselves.
-        scale: see `qs3.datamodules.clouds`.
+    in one place. Cuts, holes and jitter are each one's own. `step`, `name`, `seed`, `rank`: see
+    `generator_of`.
     """
-    result = dict(part)
-    result["points"], moves = augment.with_moves(part["points"], generator(""), scale)
+    result, device = dict(part), part["points"].device
+    chance = generator_of(step, name, seed, rank, device)
+    result["points"], moves = augment(part["points"], chance, scale)
     if "again" in part:
-        result["again"], _ = augment.with_moves(part["again"], generator("again"), scale, moves)
+        chance = generator_of(step, f"{name} again", seed, rank, device)
+        result["again"], _ = augment(part["again"], chance, scale, moves)
     return result
 
 

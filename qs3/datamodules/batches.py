@@ -81,7 +81,10 @@ class Batches:
         self.piece, self.pinned = piece, pinned
         first = next(iter(self.parts.values()))
         if piece is None:
-            self.sizes = _sizes(-(-len(first) // world), batch_size)
+            n = -(-len(first) // world)
+            self.sizes = [min(batch_size, n - i) for i in range(0, n, batch_size)]
+            if n % batch_size == 1 and n > 1:
+                self.sizes[-2:] = [batch_size + 1]
         else:
             self.sizes = [batch_size] * (piece.stop - piece.first)
 
@@ -98,7 +101,6 @@ class Batches:
             yield batch
 
     def _batches(self, name: str, part: Clouds | Labelled) -> Iterator[dict[str, Tensor]]:
-        """What comes of one domain, batch by batch."""
         clouds = part if isinstance(part, Clouds) else part.clouds
         index = self._order(name, part)
         uses: dict[str, tuple[str, ...]] = {"points": (name,)}
@@ -148,14 +150,3 @@ def generator_of(
     """Randomness of one use in one step: a function of (seed, use, epoch, step, process)."""
     names = (use, batch["epoch"], batch["index"], rank)
     return torch.Generator(device=device).manual_seed(derive(seed, *names))
-
-
-def _sizes(n: int, batch_size: int) -> list[int]:
-    """Sizes of the batches that n clouds are cut into."""
-    sizes = [batch_size] * (n // batch_size)
-    if rest := n % batch_size:
-        if rest == 1 and sizes:
-            sizes[-1] += 1
-        else:
-            sizes.append(rest)
-    return sizes

@@ -88,10 +88,6 @@ class Clouds:
         """A part of these clouds, by positions or by a mask; nothing is copied."""
         return dataclasses.replace(self, rows=self.rows[index])
 
-    def in_unit_ball(self) -> Clouds:
-        """The same clouds, each divided by its radius; nothing is copied."""
-        return dataclasses.replace(self, scale="unit_ball")
-
     def take(
         self, index: Int[Tensor, " b"], start: Int[Tensor, " b"] | None = None
     ) -> Float[Tensor, "b m 3"]:

@@ -13,15 +13,15 @@ not there; without a trainer, that takes them away, the step's "index" and "epoc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-import torch
 from lightning.pytorch import LightningDataModule
 
 from qs3.datamodules.augment import Augment, augmented
-from qs3.datamodules.batches import Batches, generator_of
+from qs3.datamodules.batches import Batches
 from qs3.datamodules.clouds import Clouds, Labelled, labels_of, load_clouds
 from qs3.datamodules.splits import RULES, first_of_class, subsample_splits
 from qs3.datasets.domain import Domain, compose_domain
@@ -153,12 +153,8 @@ class DomainData(LightningDataModule):
         result = {key: value for key, value in batch.items() if key not in ("index", "epoch")}
         if self.augment is None or self.trainer is None or not self.trainer.training:
             return result
-        rank, device = self.trainer.global_rank, batch["points"].device
-
-        def generator(use: str) -> torch.Generator:
-            return generator_of(batch, f"augment {use}".strip(), self.seed, rank, device)
-
-        return augmented(self.augment, result, generator, self.scale)
+        rank = self.trainer.global_rank
+        return augmented(self.augment, result, batch, "augment", self.seed, rank, self.scale)
 
     def _setup_training(self, dataset: PointSet) -> None:
         if len(dataset.indices("train")) == 0:
@@ -192,11 +188,8 @@ class DomainData(LightningDataModule):
         trainer = self.trainer if shuffle else None
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
         more: dict[str, Any] = {"seed": self.seed, "shuffle": shuffle, "rank": rank, "world": world}
-
-        def batches(epoch: int) -> Batches:
-            return Batches({Loader.KEY: part}, batch_size, epoch=epoch, **more)
-
-        return Loader(batches, self._epoch if shuffle else int)
+        make = partial(Batches, {"domain": part}, batch_size, **more)
+        return Loader(make, self._epoch if shuffle else int)
 
     def _epoch(self) -> int:
         if self.trainer is not None:
@@ -206,20 +199,15 @@ class DomainData(LightningDataModule):
 
 
 class Loader:
-    """Batches of one domain, made anew for each pass.
+    """The batches of one domain that `make` makes anew for each pass, whose `epoch` is asked."""
 
-    `make`: the batches of an epoch, of a domain called `KEY`; `epoch`: which one the next pass is.
-    """
-
-    KEY: ClassVar[str] = "domain"
-
-    def __init__(self, make: Callable[[int], Batches], epoch: Callable[[], int]) -> None:
+    def __init__(self, make: Callable[..., Batches], epoch: Callable[[], int]) -> None:
         self._make, self._epoch = make, epoch
-        self._length = len(make(0))
+        self._length = len(make(epoch=0))
 
     def __len__(self) -> int:
         return self._length
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        for batch in self._make(self._epoch()):
-            yield {**batch[self.KEY], "index": batch["index"], "epoch": batch["epoch"]}
+        for batch in self._make(epoch=self._epoch()):
+            yield {**batch["domain"], "index": batch["index"], "epoch": batch["epoch"]}

@@ -9,7 +9,6 @@ import contextlib
 import hashlib
 import logging
 import os
-from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +21,7 @@ from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
 from qs3.utils.files import atomic_path, remove_leftovers
 from qs3.utils.locks import locked
 from qs3.utils.pool import Processes
+from qs3.utils.processor import cores
 from qs3.utils.progress import shown
 from qs3.utils.seeding import derive
 
@@ -56,22 +56,21 @@ def farthest_points(
         return None
     starts = min(starts, stored)
 
-    def work() -> np.ndarray:
-        log.info("sampling %d of %d points of %d clouds, %dx (%s)", count, stored, n, starts, key)
-        return sample_all(points, count, starts)
-
     if cache_dir is None:
-        return work()
+        return sample_all(points, count, starts)
     cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
     name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
     shape = (n, starts, count)
     order = read_array(cache, shape, name)
     if order is None:
-        with _alone(cache_dir):  # seeds that start at the same time wait for the first
+        with contextlib.ExitStack() as stack:  # seeds that start together wait for the first
+            with contextlib.suppress(Qs3Error, OSError):  # without a lock it is done twice at worst
+                stack.enter_context(locked(cache_dir / ".lock"))
             remove_leftovers(cache_dir)
             order = read_array(cache, shape, name)
             if order is None:
-                order = keep_array(cache, work(), name)
+                log.info("sampling %d of %d points, %dx (%s)", count, stored, starts, key)
+                order = keep_array(cache, sample_all(points, count, starts), name)
     return order
 
 
@@ -106,31 +105,22 @@ def sample(
 
 
 def sample_all(
-    points: Float[np.ndarray, "n p 3"], count: int, starts: int, processes: int | None = None
+    points: Float[np.ndarray, "n p 3"], count: int, starts: int
 ) -> Int[np.ndarray, "n starts count"]:
-    """The same, with a progress bar on a terminal, and by several processes if it takes long.
-
-    How many, None asks the machine; the result does not depend on it.
-    """
-    if processes is None:  # fpsample holds the interpreter's lock, so threads would not help
-        processes = min(
-            len(os.sched_getaffinity(0)), len(points) * starts // WORTH_A_PROCESS, len(points)
-        )
+    """The same, with a progress bar on a terminal, and by several processes if it takes long."""
+    # fpsample holds the interpreter's lock, so threads would not help.
+    processes = min(len(cores()), len(points) * starts // WORTH_A_PROCESS, len(points))
     result = np.empty((len(points), starts, count), dtype=_index_type(points.shape[1]))
     begins = range(0, len(points), _CHUNK)
     chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
     pool = Processes(processes if processes > 1 else 0)
-    outcomes = pool.run(partial(_sampler, count, starts), chunks)
+    outcomes = pool.run(partial(partial, sample, count=count, starts=starts), chunks)
     for outcome in shown(outcomes, "sampling points", total=len(begins)):
         if outcome.result is None:
             raise ChildProcessError("a process died twice")
         begin = int(outcome.name)
         result[begin : begin + len(outcome.result)] = outcome.result
     return result
-
-
-def _sampler(count: int, starts: int) -> Callable[[np.ndarray], np.ndarray]:
-    return partial(sample, count=count, starts=starts)
 
 
 def _index_type(points: int) -> type[np.signedinteger]:
@@ -171,12 +161,3 @@ def _digest(order: np.ndarray, name: str) -> bytes:
     digest = hashlib.sha256(f"{name} {order.shape} {order.dtype.str}".encode())
     digest.update(np.ascontiguousarray(order).data)
     return digest.digest()
-
-
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the cache's lock if there can be one; without it, at worst the work is done twice."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(Qs3Error, OSError):
-            stack.enter_context(locked(folder / ".lock"))
-        yield

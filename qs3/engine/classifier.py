@@ -93,10 +93,7 @@ class Classifier(LightningModule):
         """One optimiser, one schedule."""
         optimizer = self._optimizer()
         if self.schedule == "cosine":
-            return {
-                "optimizer": optimizer,
-                "lr_scheduler": LambdaLR(optimizer, self.phases.cosine),
-            }
+            return [optimizer], [LambdaLR(optimizer, self.phases.cosine)]
         for group in optimizer.param_groups:
             group["initial_lr"] = group["lr"]
         self._plateau = plateau(optimizer)

@@ -7,6 +7,7 @@ known class, and get a confident answer.
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -41,7 +42,7 @@ def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
     """The `MEASURES` of a cloud in its sample number 0, and those that its scale adds."""
     row = clouds.rows[index]
     stored = np.asarray(clouds.stored[row])
-    sample = clouds.in_unit_ball().take(torch.tensor([index]))[0].numpy()
+    sample = replace(clouds, scale="unit_ball").take(torch.tensor([index]))[0].numpy()
     found = measure(stored, sample)
     if clouds.scale != "unit_ball":
         found["size"] = float(clouds.radius[row])

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor, nn
 
@@ -92,10 +91,7 @@ class StudentSelection(Callback):
         return float((table.argmax(axis=1) == labels.numpy()).mean())
 
     def _hold_out(self, data: AdaptationData, processes: int = 1) -> None:
-        """Move a part of the set that the last round would train on aside.
-
-        `processes`: that share out the rest, of which each needs two.
-        """
+        """Move a part of the last round's set aside; of the rest each process needs two."""
         assert data.pseudo is not None
         index, labels = data.pseudo
         hard, named = labels, torch.ones(len(labels), dtype=torch.bool)
@@ -133,16 +129,6 @@ class StudentSelection(Callback):
         self.epoch, self.score = state_dict["epoch"], state_dict["score"]
         self.held_out, self._weights = state_dict["held_out"], state_dict["weights"]
 
-    @property
-    def file(self) -> Path:
-        """Weights of the chosen epoch."""
-        return self.folder / STUDENT_SELECTED
-
-    @property
-    def in_words(self) -> str:
-        """Such as "snd, epoch 57, score 4.2"; what `metrics.json` has as `selection.student`."""
-        return f"{self.rule}, epoch {self.epoch}, score {self.score:.6g}"
-
     def record(self) -> dict[str, Any]:
         """What `metrics.json` has under `student`; None for scores of a net that has diverged."""
         known = {e: score if math.isfinite(score) else None for e, score in self.scores.items()}
@@ -170,11 +156,7 @@ class Student(Method):
     """
 
     def __init__(
-        self,
-        pcm: bool = False,
-        weight_step: float = 0.0,
-        mrkld: float = 0.0,
-        first_epoch: int = 0,
+        self, pcm: bool = False, weight_step: float = 0.0, mrkld: float = 0.0, first_epoch: int = 0
     ) -> None:
         super().__init__()
         self.pcm, self.weight_step, self.mrkld = pcm, weight_step, mrkld
@@ -188,7 +170,7 @@ class Student(Method):
         with use_domain(net, "target"):
             loss, logits = self._fit(net, target["points"], target["y_pseudo"], generator)
         if self.mrkld:
-            loss = loss + self.mrkld * uniform_divergence(logits)
+            loss = loss - self.mrkld * logits.log_softmax(dim=1).mean()
         terms = {"pseudo": loss}
         if "source" in batch:
             source = batch["source"]
@@ -208,8 +190,3 @@ class Student(Method):
         mixed, labels_a, labels_b, lam = mix(points, labels, generator)
         logits = net(mixed)
         return pcm_loss(logits, labels_a, labels_b, lam, self.smoothing), logits
-
-
-def uniform_divergence(logits: Float[Tensor, "b c"]) -> Float[Tensor, ""]:
-    """-1/K sum_k log p_k, mean over clouds: ln K where p is uniform, more elsewhere."""
-    return -logits.log_softmax(dim=1).mean()

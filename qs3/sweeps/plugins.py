@@ -19,6 +19,11 @@ from qs3.errors import Qs3Error
 
 log = logging.getLogger(__name__)
 
+_LOST = JobReturn(
+    status=JobStatus.FAILED,
+    _return_value=CompactHydraException("the process of a job was killed again and again"),
+)
+
 
 class OverLauncher(BasicSweeper):
     """A sweeper that composes its own jobs; whichever launcher the user chose runs them."""
@@ -110,7 +115,7 @@ class RayLauncher(BasicLauncher):
         try:
             tasks = ((str(number), (number, overrides)) for number, overrides in jobs)
             for outcome in RayTasks(**self.settings).run(make_worker, tasks):
-                found[int(outcome.name)] = outcome.result or _lost()
+                found[int(outcome.name)] = outcome.result or _LOST
                 log.info("#%s has ended: %d of %d jobs", outcome.name, len(found), len(jobs))
         except (Qs3Error, ValueError) as error:
             raise CompactHydraException(f"{type(error).__name__}: {error}") from error
@@ -126,10 +131,3 @@ def _worker(
     one = BasicLauncher()
     one.setup(**launcher)
     return lambda job: one.launch([job[1]], initial_job_idx=job[0])[0]
-
-
-def _lost() -> JobReturn:
-    """A job that never came to its end; the sweep's summary names it."""
-    result = JobReturn(status=JobStatus.FAILED)
-    result.return_value = CompactHydraException("the process of a job was killed again and again")
-    return result

@@ -127,10 +127,7 @@ class LabelFreeSearch(OverLauncher):
                 return done  # e.g. no data: the next would end like these
 
     def _refuse_changed(self, study: Study, fixed: Sequence[str]) -> None:
-        """Raise if the study's runs were trained on other data, or on another classifier.
-
-        Objectives of two datasets cannot be compared. One run stands for all.
-        """
+        """Raise if one of the study's runs, which stands for all, was trained on other data."""
         from optuna.trial import TrialState
 
         for trial in study.get_trials(states=(TrialState.COMPLETE,)):
@@ -141,7 +138,6 @@ class LabelFreeSearch(OverLauncher):
                 return
 
     def _composed(self, overrides: Sequence[str]) -> DictConfig:
-        """The config of a job."""
         assert self.hydra_context is not None
         assert self.config is not None
         cfg = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
@@ -231,14 +227,11 @@ def distribution(one: Override) -> BaseDistribution:
 
 def words(params: Mapping[str, Any]) -> dict[str, str]:
     """A trial's values in Hydra's grammar: numbers with six digits, text quoted if need be."""
-    plain = {None: "null", True: "true", False: "false"}
 
     def word(value: Any) -> str:
-        if value is None or isinstance(value, bool):
-            return plain[value]
         if isinstance(value, str):
             return quoted(value)
-        return f"{value:.6g}" if isinstance(value, float) else str(value)
+        return f"{value:.6g}" if isinstance(value, float) else json.dumps(value)
 
     return {key: word(value) for key, value in params.items()}
 

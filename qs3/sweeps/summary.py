@@ -49,7 +49,12 @@ class SummaryOfSeeds(Callback):
         register()
         self.objective = config.get("objective")
         if self.objective is not None:
-            _check_fair(config)
+            params = config.hydra.sweeper.get("params") or {}
+            try:
+                check_objective(config.objective)
+                check_varied(split(config.hydra.overrides.task, params)[1].values())
+            except ConfigError as error:  # Hydra makes a warning of a callback's exception
+                raise SystemExit(f"{type(error).__name__}: {error}") from error
         self._main = os.getpid()
         folder = make_folder(Path(config.hydra.sweep.dir).resolve())
         handle, name = tempfile.mkstemp(prefix=".multirun-", suffix=".txt", dir=folder)
@@ -166,13 +171,3 @@ def _varied(jobs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, str]], li
     words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
     keys = dict.fromkeys(key for one in words for key in one)
     return words, [key for key in keys if len({one.get(key) for one in words}) > 1]
-
-
-def _check_fair(config: DictConfig) -> None:
-    """Leave, with a message, unless the runs differ in nothing that says how they are judged."""
-    params = config.hydra.sweeper.get("params") or {}
-    try:
-        check_objective(config.objective)
-        check_varied(split(config.hydra.overrides.task, params)[1].values())
-    except ConfigError as error:  # Hydra makes a warning of a callback's exception
-        raise SystemExit(f"{type(error).__name__}: {error}") from error

@@ -15,7 +15,6 @@ from torch import nn
 
 from qs3.config import hashing
 from qs3.config.hydra import component_names
-from qs3.datamodules.clouds import Labelled
 from qs3.evaluation.expected import expected_accuracy, held_out
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms, minimise_entropy
@@ -46,7 +45,7 @@ from qs3.runs.predictions import (
     write_predictions_of_files,
 )
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, WarmupSelection
-from qs3.selftraining.student_selection import StudentSelection
+from qs3.selftraining.student_selection import STUDENT_SELECTED, StudentSelection
 from qs3.store.meta import read_manifest
 from qs3.training.fit import Built
 from qs3.training.load import Loaded, Shares, prior_beside, shares_of_student
@@ -76,6 +75,7 @@ class SavedNets:
         self.clouds = {
             "test": loaded.evaluation.test,
             "target": loaded.data.target,  # the training clouds
+            "labelled": loaded.data.labelled.clouds,
             "validation": loaded.data.validation.clouds,
         }
         self.classifier = built.classifier
@@ -99,15 +99,12 @@ class SavedNets:
         return self._nets[key]
 
     def of(self, which: str, file: Path, norms: str | None = None) -> Float[np.ndarray, "n c"]:
-        """Probabilities of "test", "target" or "validation" clouds, by norms for their domain.
+        """Probabilities of some of the `clouds` by a file's weights, with norms for their domain.
 
-        Args:
-            which: of `clouds`.
-            file: with the weights.
-            norms: of clouds of the target other ones than `evaluation.norms`.
+        `norms`: of clouds of the target others than `evaluation.norms`.
         """
         norms, domain = norms or self.run.cfg.evaluation.norms, "target"
-        if which == "validation" and self.data.owner == "source":
+        if which in ("validation", "labelled") and self.data.owner == "source":
             norms, domain = TRAINED, "source"
         key = self._weights_in(file), which, norms
         if key not in self._predicted:
@@ -130,7 +127,8 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
     choice = None if built.student.rule == LAST else built.student
-    file = choice.file if choice else files["student" if run.scheme.rounds else "selected"]
+    chosen = run.folder / STUDENT_SELECTED
+    file = chosen if choice else files["student" if run.scheme.rounds else "selected"]
     learnt = loaded.learnt
     if run.scheme.rounds:
         learnt = shares_of_student(run.scheme, loaded.labelled, built.rounds.records[-1])
@@ -150,7 +148,11 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     predictions = evaluation.predictions_of(reported(file))
     if built.trainer.is_global_zero:
         _write(run, loaded, nets, file, learnt, predictions)
-    prior, called, student = prior_of(file), component_names(cfg), None
+    prior, called, student, training = prior_of(file), component_names(cfg), None, None
+    if cfg.data.clouds_a_class is not None:
+        hits = nets.of("labelled", file).argmax(axis=1) == data.labelled.labels.numpy()
+        log.info("%.1f %% of the %d training clouds are right", 100 * hits.mean(), len(hits))
+        training = TrainingAccuracy(n=len(hits), accuracy=float(hits.mean()))
     if choice is not None:
         of_last = EpochScores(epoch=run.phases.total - 1, scores=scores["student"])
         student = StudentChoice(**choice.record(), last=of_last)
@@ -197,9 +199,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         student=student,
         validators=without_labels(nets.of("target", file), choice),
         quality=_quality(run, loaded, nets, file),
-        training=None
-        if cfg.data.clouds_a_class is None
-        else training_accuracy(nets, file, data.labelled),
+        training=training,
         data=DataHashes(**loaded.started["data"]),
         made_of=loaded.made_of,
         times=built.clock.taken(),
@@ -216,7 +216,7 @@ def _selection(
     teacher = f"{rule}, epoch {warmup.epoch}"
     if rule == "given":
         teacher = f"given, {loaded.started['versions']['weights'].rpartition(' ')[0]}"
-    student = choice.in_words if choice else LAST
+    student = f"{choice.rule}, epoch {choice.epoch}, score {choice.score:.6g}" if choice else LAST
     return Selection(
         teacher=teacher,
         student=student if run.scheme.rounds else teacher,
@@ -255,16 +255,6 @@ def without_labels(
     if choice is not None and choice.rule == PSEUDO_VAL and choice.score is not None:
         scores[PSEUDO_VAL] = choice.score
     return {name: score if math.isfinite(score) else None for name, score in scores.items()}
-
-
-def training_accuracy(nets: SavedNets, file: Path, labelled: Labelled) -> TrainingAccuracy:
-    """How many clouds the reported net was trained on, and the share that is right."""
-    domain = "source" if nets.data.owner == "source" else "target"
-    size = nets.run.cfg.data.eval_batch_size
-    table = predict(nets(file), labelled.clouds.points, size, nets.device, domain=domain)
-    right = float((table.argmax(axis=1) == labelled.labels.numpy()).mean())
-    log.info("%.1f %% of the %d training clouds are right", 100 * right, len(table))
-    return TrainingAccuracy(n=len(table), accuracy=right)
 
 
 def _write(

@@ -165,14 +165,7 @@ def _build_each(group: DictConfig | None) -> list[Any]:
 
 
 def _fit(run: Run, loaded: Loaded, built: Built) -> None:
-    """One `Trainer.fit` over all phases.
-
-    A checkpoint lies between two epochs; a resume repeats an epoch. What comes after it reads saved
-    weights alone, so it is the same after any interruption.
-
-    Raises:
-        ConfigError: a callback has ended the training.
-    """
+    """One `Trainer.fit` over all phases; what comes after it reads saved weights alone."""
     data, kept = loaded.data, run.cfg.data.cache_dir
     clouds = (data.all_labelled, data.target, loaded.evaluation.test)
     remember(built.classifier.net, clouds, Path(kept) if kept else None)
@@ -197,7 +190,7 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
 
 
 def settle_process(threads: int, float32_matmul: str = "highest") -> None:
-    """What a training sets for its whole process: memory is kept, no tensor is filled in vain."""
+    """What a training sets for its whole process."""
     keep_freed_memory()
     # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]

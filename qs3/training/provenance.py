@@ -1,9 +1,8 @@
 """What a run notes when it starts, and compares when it goes on or is asked for again.
 
 A finished run is the result of its command, unless its data, its settings or its classifier have
-changed since. Somebody who works on a method or a net runs it again and again, and the version of
-qs3 stays while they do: so hashes of the code that a run executes are compared, too. Imports no
-torch before it is needed.
+changed since: hashes of the code that a run executes are compared, too, as the version stays while
+somebody works on a method. Imports no torch before it is needed.
 """
 
 import contextlib

@@ -81,23 +81,19 @@ class SharedWarmup(Checkpoint):
         """Copy the checkpoint that has just been written, one epoch before the warm-up's end."""
         if trainer.current_epoch != self.last_but_one or not trainer.is_global_zero:
             return
+        if self.shared is None:
+            return
         try:
-            if self.shared is not None:
-                with self._alone():
-                    self._give()
+            with self._alone():
+                if self._is_there():
+                    return
+                (self.shared / runs.STARTED).unlink(missing_ok=True)
+                remove_leftovers(self.shared)  # of a copy that was killed
+                for name in _FILES:
+                    copy_file(self.folder / name, self.shared / name)
+                write_json(self.shared / runs.STARTED, _mark(self.sha256, self.folder))
         except Exception as error:  # a full disk, say: sharing is a convenience
             log.warning("the warm-up cannot be shared (%s); training goes on", error)
-
-    def _give(self) -> None:
-        """Copy the run's files, unless a complete warm-up is there; a kill leaves no mark."""
-        assert self.shared is not None
-        if self._is_there():
-            return
-        (self.shared / runs.STARTED).unlink(missing_ok=True)
-        remove_leftovers(self.shared)  # of a copy that was killed
-        for name in _FILES:
-            copy_file(self.folder / name, self.shared / name)
-        write_json(self.shared / runs.STARTED, _mark(self.sha256, self.folder))
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:

@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import json
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -29,14 +30,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            prefix=f".{path.name}.", suffix=f".tmp{path.suffix}", dir=path.parent
-        )
-        os.close(handle)
-        temporary = Path(name)
+        temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp{path.suffix}")
+        temporary.touch(exist_ok=False)
         yield temporary
         _flush(temporary)
-        os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
         temporary = None
         _flush(path.parent)
@@ -113,15 +110,7 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-def _umask() -> int:
-    """The permissions that this process withholds from new files (mkstemp withholds more)."""
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
-
-
 def copy_file(source: Path, target: Path) -> None:
     """Copy a file, atomically; its folder is made."""
-    make_folder(target.parent)
     with atomic_path(target) as temporary:
         shutil.copyfile(source, temporary)

@@ -233,11 +233,7 @@ def _a_method_that_it_knows() -> Iterator[None]:
 
 @contextmanager
 def _no_script(make_worker: Callable[[], Any]) -> Iterator[None]:
-    """A new process does not run the script that started it, unless its work is defined there.
-
-    A script that asks for a dataset in its first lines, without `if __name__ == "__main__"`, would
-    do so again in each process.
-    """
+    """Start a process that does not run the script again, unless its work is defined there."""
     if b"__main__" in pickle.dumps(make_worker):
         yield
         return

@@ -1,16 +1,11 @@
 """How far a loop is: a bar on a terminal, a line now and then in a log."""
 
-from __future__ import annotations
-
 import logging
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
+from typing import TypeVar
 
 T = TypeVar("T")
 
@@ -21,37 +16,43 @@ SECONDS_BETWEEN_LINES = 10.0
 
 @contextmanager
 def progress_bar(label: str, *, total: int, done: int = 0) -> Iterator[Callable[[], None]]:
-    """Show how far a loop is, with rate and time left; gives a function to call after each step.
+    """Show how far a loop is, with the time left; gives a function to call after each step.
 
     Of `total` steps an earlier run has `done` some.
     """
+    if sys.stderr.isatty():
+        from rich import progress
+        from rich.console import Console
+
+        with progress.Progress(
+            progress.TextColumn("{task.description}"),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("left"),
+            progress.TimeRemainingColumn(),
+            console=Console(stderr=True),
+            # What goes to a file or a pipe stays what it is; on a terminal it goes above the bar.
+            redirect_stdout=sys.stdout.isatty(),
+        ) as bar:
+            task = bar.add_task(label, total=total, completed=done)
+            yield lambda: bar.advance(task)
+        return
+
     start = last = time.monotonic()
     steps = done
-
-    def rate() -> float:
-        return (steps - done) / max(time.monotonic() - start, 1e-9)
 
     def log_line() -> None:
         nonlocal steps, last
         steps += 1
-        if time.monotonic() - last >= SECONDS_BETWEEN_LINES or steps >= total:
-            last = time.monotonic()
-            left = (total - steps) / rate()
-            line = "%s: %d of %d, %s, %.0f s left"
-            log.info(line, label, steps, total, _speed(rate()), left)
+        now = time.monotonic()
+        if now - last >= SECONDS_BETWEEN_LINES or steps >= total:
+            last = now
+            each = (now - start) / (steps - done)
+            left = (total - steps) * each
+            log.info("%s: %d of %d, %.3g s each, %.0f s left", label, steps, total, each, left)
 
-    if not sys.stderr.isatty():
-        yield log_line
-        return
-    with terminal_bar("{task.fields[rate]}") as bar:
-        task = bar.add_task(label, total=total, completed=done, rate="")
-
-        def advance() -> None:
-            nonlocal steps
-            steps += 1
-            bar.update(task, advance=1, rate=_speed(rate()))
-
-        yield advance
+    yield log_line
 
 
 def shown(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
@@ -65,30 +66,3 @@ def shown(items: Iterable[T], label: str, total: int | None = None) -> Iterator[
     console = Console(stderr=True)
     quiet = not console.is_terminal
     yield from track(items, label, total, console=console, transient=True, disable=quiet)
-
-
-def terminal_bar(*fields: str, transient: bool = False) -> Progress:
-    """A bar on stderr, to be started: description, bar, steps of all, `fields`, time gone and left.
-
-    Fields are formats of rich: "epochs," or "{task.fields[rate]}". A transient bar goes away.
-    """
-    from rich import progress
-    from rich.console import Console
-
-    return progress.Progress(
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        *map(progress.TextColumn, fields),
-        progress.TimeElapsedColumn(),
-        progress.TextColumn("left"),
-        progress.TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=transient,
-        # What goes to a file or a pipe stays what it is; on a terminal it goes above the bar.
-        redirect_stdout=sys.stdout.isatty(),
-    )
-
-
-def _speed(rate: float) -> str:
-    return f"{rate:.1f}/s" if rate >= 1 else f"{1 / rate:.1f} s each"

@@ -13,9 +13,10 @@ def aligned(rows: Rows, *, numbers: bool = False, rule: bool = True) -> list[str
 
     With `numbers` all columns but the first are flush right; `rule` is dashes below the header.
     """
-    widths = _widths(rows)
-    lines = ["  ".join(cells).rstrip() for cells in _padded(rows, widths, numbers)]
-    return [lines[0], *["  ".join("-" * width for width in widths)] * rule, *lines[1:]]
+    padded = _padded(rows, numbers)
+    first, *lines = ["  ".join(cells).rstrip() for cells in padded]
+    rules = ["  ".join("-" * len(cell) for cell in padded[0])] if rule else []
+    return [first, *rules, *lines]
 
 
 def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
@@ -24,10 +25,10 @@ def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
     A `|` in a cell is escaped; what else Markdown reads as a sign is kept.
     """
     rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
-    widths = _widths(rows)
-    first, *lines = [f"| {' | '.join(cells)} |" for cells in _padded(rows, widths, numbers)]
+    padded = _padded(rows, numbers)
+    first, *lines = [f"| {' | '.join(cells)} |" for cells in padded]
     end = ":" if numbers else "-"
-    rules = ["-" * (widths[0] + 2), *("-" * (width + 1) + end for width in widths[1:])]
+    rules = ["-" * (len(cell) + 1) + (end if i else "-") for i, cell in enumerate(padded[0])]
     return [first, f"|{'|'.join(rules)}|", *lines]
 
 
@@ -48,11 +49,10 @@ def printable(text: str) -> str:
     )
 
 
-def _widths(rows: Rows) -> list[int]:
-    return [max(map(len, column)) for column in zip(*rows, strict=True)]
-
-
-def _padded(rows: Rows, widths: Sequence[int], numbers: bool) -> list[list[str]]:
-    right = [numbers and i > 0 for i in range(len(widths))]
-    sides = [str.rjust if at_right else str.ljust for at_right in right]
-    return [[f(c, w) for f, c, w in zip(sides, row, widths, strict=True)] for row in rows]
+def _padded(rows: Rows, numbers: bool) -> list[tuple[str, ...]]:
+    columns = []
+    for i, column in enumerate(zip(*rows, strict=True)):
+        width = max(map(len, column))
+        pad = str.rjust if numbers and i else str.ljust
+        columns.append([pad(cell, width) for cell in column])
+    return list(zip(*columns, strict=True))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -41,7 +43,7 @@ def test_in_metres_clouds_are_centred_and_keep_their_size():
     order = np.array([[[3, 0]], [[1, 2]]], dtype=np.int16)
     some = Clouds.of(stored, order, "metres").at(np.array([1])).take(torch.tensor([0]))
     assert np.array_equal(some.numpy(), 2 * about[None, [1, 2]])
-    ball = clouds.in_unit_ball()
+    ball = replace(clouds, scale="unit_ball")
     assert ball.stored is clouds.stored
     assert np.array_equal(ball.points.numpy(), unit_ball(stored))
 

@@ -54,7 +54,7 @@ def test_a_method_s_copy_of_the_net_has_no_hooks_and_does_not_learn() -> None:
     teacher = classifier.method.teacher
     assert classifier.net.backbone._forward_hooks
     assert not any(module._forward_hooks for module in teacher.modules())
-    optimizer = classifier.configure_optimizers()["optimizer"]
+    optimizer = classifier.configure_optimizers()[0][0]
     before = {key: value.clone() for key, value in teacher.state_dict().items()}
     classifier.net(torch.randn(4, 16, 3)).sum().backward()
     optimizer.step()
@@ -65,7 +65,7 @@ def test_a_method_s_copy_of_the_net_has_no_hooks_and_does_not_learn() -> None:
 
 def test_each_module_has_its_learning_rate() -> None:
     classifier = _classifier(PointDan(classifier_rate=3.0), build_net=lambda: pointdan(4, nodes=4))
-    groups = classifier.configure_optimizers()["optimizer"].param_groups
+    groups = classifier.configure_optimizers()[0][0].param_groups
     assert [group["lr"] for group in groups] == [1e-3, pytest.approx(3e-3)]
     assert {id(p) for p in groups[1]["params"]} == {
         id(p) for p in classifier.net.get_submodule("head").parameters()
