@@ -223,6 +223,7 @@ def test_the_time_limit_is_not_a_failure_of_the_task(tmp_path):
     assert deaths == {"b": 1}
 
 
+@pytest.mark.slow
 def test_what_no_node_has_is_an_error_at_once():
     """Ray itself would wait for ever."""
     with pytest.raises(ConfigError):

@@ -52,7 +52,10 @@ def test_up_turns_the_cloud() -> None:
 @pytest.mark.parametrize(
     ("training", "logits", "norm"),
     [
-        (True, [-0.09085458, 0.08415982, -0.05754179, 0.01548372], 54.9939534),
+        pytest.param(
+            *(True, [-0.09085458, 0.08415982, -0.05754179, 0.01548372], 54.9939534),
+            marks=pytest.mark.slow,
+        ),
         (False, [-0.07243522, 0.08327869, -0.07432694, 0.04749585], 0.46095962),
     ],
 )

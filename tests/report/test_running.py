@@ -13,6 +13,7 @@ from tests.running import main
 from tests.training.toy import overrides, write_toy
 
 
+@pytest.mark.slow
 def test_only_what_is_missing_is_run(tmp_path):
     table = build_table("cad10", tmp_path)
     cells = {cell.row: cell for cell in table.cells}

@@ -83,6 +83,7 @@ def rows(folder: Path, round_: int) -> list[dict[str, str]]:
     return list(csv.DictReader(text.splitlines()))
 
 
+@pytest.mark.slow
 def test_same_weights_same_selection(both: Both) -> None:
     one, two = (load(folder / "warmup_selected.pt") for folder in (both.one, both.two))
     assert all(torch.equal(one[name], two[name]) for name in one)
@@ -95,6 +96,7 @@ def test_same_weights_same_selection(both: Both) -> None:
     assert 10 < records[0][0]["total_selected"] < 75
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("round_", [0, 1])
 def test_both_train_on_the_selected_and_on_nothing_else(both: Both, round_: int) -> None:
     """75 clouds in the table, each once; the selected ones shared out."""
@@ -116,6 +118,7 @@ def test_both_train_on_the_selected_and_on_nothing_else(both: Both, round_: int)
         assert sum(times.values()) - len(selected) == len(selected) % 2  # made even, by one cloud
 
 
+@pytest.mark.slow
 def test_weights_are_the_same_in_both(both: Both) -> None:
     """At the end of every epoch; running statistics, too, of which the first process's count."""
     for epoch in range(WARMUP - 1, WARMUP + 2 * EPOCHS):

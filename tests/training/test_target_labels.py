@@ -58,7 +58,7 @@ def truth_of(folder: Path) -> Truth:
 
 
 class Watch:
-    """Searches from within `training_step`, once an epoch; and for what is planted there."""
+    """Searches as each phase begins, from within `training_step`; and for what is planted there."""
 
     def __init__(self) -> None:
         self.found: set[str] = set()
@@ -69,7 +69,7 @@ class Watch:
 
     def look(self, classifier: Classifier, batch: dict[str, Any], batch_idx: int) -> None:
         self.keys.update(key for part in batch.values() if isinstance(part, dict) for key in part)
-        if batch_idx:
+        if batch_idx or not classifier.phases.starts(classifier.current_epoch):
             return
         assert self.truth is not None
         trainer = classifier.trainer
