@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qs3.errors import ConfigError, DataError
-from qs3.store.parts import PartFiles
+from qs3.store.meta import ManifestRow
+from qs3.store.parts import (
+    CLOUDS,
+    CONFIG,
+    RECIPE,
+    VIEWS,
+    PartFiles,
+    check_ours,
+    delete_dataset,
+)
+from qs3.store.store import write_pointset
 from tests.fixtures.harm import Harm
 
 
@@ -94,3 +105,48 @@ def test_arrays_are_read_when_they_are_asked_for(tmp_path):
     (tmp_path / "parts" / "one.npz").write_bytes(data)
     with pytest.raises(DataError):
         dict(parts.read("one")[1])
+
+
+def _dataset(folder):
+    """A finished dataset that was generated, with everything that may lie there."""
+    write_pointset(
+        folder,
+        name="d",
+        classes=("a",),
+        arrays={"points": np.zeros((1, 4, 3), np.float32)},
+        rows=[ManifestRow("a/train/0", "a", "train")],
+        meta={},
+    )
+    PartFiles(folder).begin({"seed": 0})
+    PartFiles(folder).write("a", {}, {"points": np.zeros((4, 3), np.float32)})
+    (folder / VIEWS).mkdir()
+    for name in (CLOUDS, CONFIG, f"{VIEWS}/v.png", "notes.txt"):
+        (folder / name).write_text("x")
+
+
+def test_only_a_dataset_that_was_made_here_is_replaced(tmp_path):
+    check_ours(tmp_path, "generate.py")  # nothing is there
+    _dataset(tmp_path)
+    check_ours(tmp_path, "generate.py")
+    (tmp_path / RECIPE).unlink()
+    with pytest.raises(DataError):
+        check_ours(tmp_path, "generate.py")
+
+
+def test_a_dataset_is_deleted_and_other_files_are_not(tmp_path):
+    _dataset(tmp_path)
+    delete_dataset(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    delete_dataset(tmp_path)  # nothing is left to delete
+
+
+def test_a_kill_while_deleting_leaves_no_finished_dataset_and_no_part_without_recipe(
+    tmp_path, monkeypatch
+):
+    """Whatever was deleted last: meta.yaml goes first, the recipe last."""
+    _dataset(tmp_path)
+    gone = []
+    unlink = Path.unlink
+    monkeypatch.setattr(Path, "unlink", lambda p, **how: (gone.append(p.name), unlink(p, **how)))
+    delete_dataset(tmp_path)
+    assert (gone[0], gone[-1]) == ("meta.yaml", RECIPE)
