@@ -181,7 +181,4 @@ def _differences(old: Any, new: Any, key: str = "") -> list[str]:
             for name in dict.fromkeys([*old, *new])
             for line in _differences(old.get(name), new.get(name), f"{key}.{name}" if key else name)
         ]
-    if isinstance(old, list) and isinstance(new, list) and len(str(old)) > 80:
-        other = sorted(map(str, {*map(str, old)} ^ {*map(str, new)}))
-        return [f"  {key}: {len(old)} there, {len(new)} now, such as {' '.join(other[:1])}"]
     return [f"  {key}: {json.dumps(old):.80} there, {json.dumps(new):.80} now"]
