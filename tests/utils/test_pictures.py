@@ -32,7 +32,8 @@ def test_the_nearest_point_stays():
     line = np.outer([-1.0, 1.0], towards)
     colours = np.array([[1.0, 0, 0], [0, 0, 1.0]])
     drawn = cloud_image(line, colours=colours)
-    assert drawn[ink(drawn)].tolist() == [[0, 0, 255]] * ink(drawn).sum()
+    middle = drawn.shape[0] // 2
+    assert drawn[middle, middle].tolist() == [0, 0, 255]
 
 
 def test_values_have_the_colours_of_the_map_and_unknown_ones_are_dark():
