@@ -64,7 +64,7 @@ def predict(
         qs3 predict depth=frame.png mask=mask.png intrinsics=525,525,319.5,239.5 camera_height=1.2
         qs3 predict ckpt=RUN depth=a.npy box=210,95,480,430 intrinsics=cam.yaml up=0,-0.97,-0.24
     """
-    from qs3.evaluation.expected import in_words
+    from qs3.evaluation.unlabelled import in_words
     from qs3.inference import inputs, model_file, table
     from qs3.inference import page as pages
     from qs3.inference import predict as steps

@@ -23,7 +23,7 @@ from lightning.pytorch import LightningDataModule
 from qs3.datamodules.augment import Augment, augmented
 from qs3.datamodules.batches import Batches
 from qs3.datamodules.clouds import Clouds, Labelled, labels_of, load_clouds
-from qs3.datamodules.splits import RULES, first_of_class, subsample_splits
+from qs3.datamodules.splits import RULES, first_of_class
 from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError, DataError
 from qs3.store.store import PointSet
@@ -123,7 +123,7 @@ class DomainData(LightningDataModule):
         dataset = self.domain.open(verify=False)
         self.classes, self.sha256 = tuple(dataset.classes), dataset.sha256
         if self.clouds_a_split is not None:
-            dataset = subsample_splits(dataset, self.clouds_a_split)
+            dataset = dataset.fewer(self.clouds_a_split)
         if stage in (None, "fit", "validate") and self.train is None:
             self._setup_training(dataset)
         if stage in (None, "test", "predict") and self.test is None and "test" in dataset.counts():

@@ -18,8 +18,7 @@ from jaxtyping import Float, Int
 
 from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
-from qs3.utils.files import atomic_path, remove_leftovers
-from qs3.utils.locks import locked
+from qs3.utils.files import atomic_path, locked, remove_leftovers
 from qs3.utils.pool import Processes
 from qs3.utils.processor import cores
 from qs3.utils.progress import shown

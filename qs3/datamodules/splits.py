@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.errors import DataError
-from qs3.store.store import PointSet, evenly
 from qs3.utils.seeding import derive
 
 STRATIFIED_SEED = 0
@@ -74,17 +73,6 @@ def _objects(ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
 
 
 RULES = MappingProxyType({"lineage": lineage, "stratified": stratified})
-
-
-def subsample_splits(dataset: PointSet, count: int) -> PointSet:
-    """At most `count` clouds of each split, at even steps; for `debug=fast`.
-
-    They keep their order and ids, and the hash is still that of the whole dataset.
-    """
-    chosen: list[int] = []
-    for split in dataset.counts():
-        chosen += evenly(dataset.indices(split), count)
-    return dataset.at(np.sort(chosen))
 
 
 def first_of_class(

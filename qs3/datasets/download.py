@@ -17,8 +17,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
 from qs3.errors import DataError, Qs3Error
-from qs3.utils.files import make_folder, reading, sha256_file, write_json
-from qs3.utils.locks import locked
+from qs3.utils.files import locked, make_folder, reading, sha256_file, write_json
 from qs3.utils.settings import settings
 
 MARK = ".download.json"

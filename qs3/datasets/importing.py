@@ -25,7 +25,7 @@ from qs3.classes import known_as
 from qs3.errors import DataError
 from qs3.store.meta import SPLITS, MadeOf, ManifestRow, is_begun, is_finished
 from qs3.store.store import write_pointset
-from qs3.utils.locks import locked
+from qs3.utils.files import locked
 from qs3.utils.progress import shown
 from qs3.utils.settings import settings
 

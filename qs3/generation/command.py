@@ -46,8 +46,7 @@ from qs3.store.parts import (
     delete_dataset,
 )
 from qs3.store.store import PointSet, counts_text, open_pointset, write_pointset
-from qs3.utils.files import write_text
-from qs3.utils.locks import owned
+from qs3.utils.files import owned, write_text
 from qs3.utils.pool import Pool
 from qs3.utils.progress import progress_bar
 

@@ -30,7 +30,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.evaluation.expected import HeldOut
+from qs3.evaluation.unlabelled import HeldOut
 from qs3.runs.checkpoints import load, save
 from qs3.utils.files import atomic_path, make_folder, reading, sha256_file, write_json, write_text
 from qs3.utils.settings import problems
@@ -70,9 +70,9 @@ class Result:
         weights: of the net.
         floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
         worth: accuracy on real objects, in a sentence; "" if it was not measured.
-        held_out: what it is on held-out labelled clouds, see `qs3.evaluation.expected`; None if
+        held_out: what it is on held-out labelled clouds, see `qs3.evaluation.unlabelled`; None if
             nothing is known.
-        learnt: shares of the classes in its training, see `qs3.evaluation.prior`; likewise.
+        learnt: shares of the classes in its training, see `qs3.evaluation.unlabelled`; likewise.
     """
 
     model: dict[str, Any]

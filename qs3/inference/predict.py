@@ -12,8 +12,8 @@ import torch
 
 from qs3.datasets.pointed import LEVEL, PLANES
 from qs3.errors import ConfigError, DataError
-from qs3.evaluation.expected import expected_accuracy
 from qs3.evaluation.ood import other_units
+from qs3.evaluation.unlabelled import expected_accuracy
 from qs3.inference.inputs import Sample
 from qs3.inference.model_file import find_result
 from qs3.inference.predictor import Predictor, load

@@ -26,7 +26,7 @@ from qs3.datasets.importing import check_cloud, thinned, turned
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, other_units, relax_min_points
-from qs3.evaluation.prior import POWER, Prior, read_prior
+from qs3.evaluation.unlabelled import POWER, Prior, read_prior
 from qs3.inference.inputs import Sample, pointed
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.processor import keep_freed_memory
@@ -279,7 +279,7 @@ def load(
             package, if you trust it to be built with any arguments.
         prior: how common classes are where the clouds come from: "rooms", as in ScanNet's, or
             {"chair": 4, "bathtub": 0}, where those not named count as 1; None: as in training.
-        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.evaluation.prior`).
+        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.evaluation.unlabelled`).
 
     Raises:
         MissingDataError: no finished run there.

@@ -20,7 +20,7 @@ import numpy as np
 from qs3.config.hydra import in_multirun
 from qs3.datasets.domain import Domain
 from qs3.errors import DataError, MissingDataError, Qs3Error
-from qs3.evaluation.expected import in_words
+from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.report import run_charts
 from qs3.report.datasets import opened_domain, part_of

@@ -41,7 +41,7 @@ from qs3.runs.metrics import read_metrics
 from qs3.sweeps.plugins import ListedJobs, OverLauncher, RayLauncher
 from qs3.training.provenance import refuse_changed
 from qs3.training.run import run_of
-from qs3.utils.locks import locked
+from qs3.utils.files import locked
 from qs3.utils.text_table import aligned
 
 if TYPE_CHECKING:

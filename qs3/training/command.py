@@ -11,14 +11,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.datasets.domain import check_or_make
-from qs3.evaluation.expected import in_words
+from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.runs.folder import read_code
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
 from qs3.training.provenance import changed_files, refuse_changed
 from qs3.training.run import Run, run_of
-from qs3.utils.locks import owned
+from qs3.utils.files import owned
 
 log = logging.getLogger(__name__)
 

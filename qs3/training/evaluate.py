@@ -15,11 +15,10 @@ from torch import nn
 
 from qs3.config import hashing
 from qs3.config.hydra import component_names
-from qs3.evaluation.expected import expected_accuracy, held_out
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms, minimise_entropy
 from qs3.evaluation.ood import limits, ood_reasons_of_all, ood_share, source_limits
-from qs3.evaluation.prior import Prior
+from qs3.evaluation.unlabelled import Prior, expected_accuracy, held_out
 from qs3.evaluation.validators import LABEL_FREE, LAST, PSEUDO_VAL
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result

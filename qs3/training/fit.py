@@ -8,7 +8,7 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from lightning.pytorch import Callback, Trainer
@@ -33,7 +33,7 @@ from qs3.training.load import Loaded, load_data, read_given
 from qs3.training.provenance import changed
 from qs3.training.run import STUDENT, Run
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
-from qs3.utils.processor import Moment, cores, keep_freed_memory, number_of, processor_seconds
+from qs3.utils.processor import Moment, cores, free_cores, keep_freed_memory, processor_seconds
 
 log = logging.getLogger(__name__)
 
@@ -187,6 +187,13 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     if built.trainer.is_global_zero:
         save(copy_weights(built.classifier.net), run.folder / STUDENT)
     built.trainer.strategy.barrier("student saved")
+
+
+def number_of(threads: int | Literal["auto"] | None) -> int:
+    """`trainer.threads` as a number: null is all cores, "auto" those that are free now."""
+    if threads is None:
+        return len(cores())
+    return free_cores() if threads == "auto" else threads
 
 
 def settle_process(threads: int, float32_matmul: str = "highest") -> None:

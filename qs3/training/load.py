@@ -13,11 +13,10 @@ from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.clouds import Clouds, labels_of, load_clouds
 from qs3.datamodules.phases import SelfTrainingConfig
-from qs3.datamodules.splits import subsample_splits
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
-from qs3.evaluation.prior import ESTIMATED, Prior, estimate_shares, read_prior, shares_of
+from qs3.evaluation.unlabelled import ESTIMATED, Prior, estimate_shares, read_prior, shares_of
 from qs3.inference.model_file import Result, read_result
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf, RoundRecord
@@ -32,7 +31,7 @@ _BELOW_M = 0.3  # under all of the other domain; floors are known to a decimetre
 _LOOKED_AT = 1000  # clouds, for the floor: those are read from disk
 
 Shares = Float[np.ndarray, " c"]
-"""[C], of the classes in what a net learnt from: u in `qs3.evaluation.prior`."""
+"""[C], of the classes in what a net learnt from: u in `qs3.evaluation.unlabelled`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +122,7 @@ def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
     # What is not a prior ends a run before it trains.
     prior_beside(cfg.evaluation, target.classes, learnt, lambda: learnt[None])
     if (few := cfg.data.clouds_a_split) is not None:
-        target = subsample_splits(target, few)
+        target = target.fewer(few)
     split = "test" if "test" in target.counts() else "train"  # somebody's own scans have no other
     if split == "train" or labels_of(target, split) is None:
         log.warning("%s has no labels for a test: only predictions are counted", target.name)

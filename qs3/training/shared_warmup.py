@@ -30,8 +30,7 @@ from qs3.engine.loggers import HISTORY
 from qs3.errors import DataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
-from qs3.utils.files import copy_file, remove_leftovers, sha256_file, write_json
-from qs3.utils.locks import locked
+from qs3.utils.files import copy_file, locked, remove_leftovers, sha256_file, write_json
 
 log = logging.getLogger(__name__)
 

@@ -2,10 +2,12 @@
 
 The one idea: write a temporary file in the same folder, flush it to the disk, then rename it over
 the final name. A reader sees the old file or the new one, never a mixture. A kill leaves at most
-a temporary file, which `remove_leftovers` clears.
+a temporary file, which `remove_leftovers` clears. Locks between processes are gone when the process
+ends.
 """
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
@@ -17,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import DataError, MissingDataError, Qs3Error
+
+_LOCK = ".lock"
 
 
 @contextlib.contextmanager
@@ -114,3 +118,32 @@ def copy_file(source: Path, target: Path) -> None:
     """Copy a file, atomically; its folder is made."""
     with atomic_path(target) as temporary:
         shutil.copyfile(source, temporary)
+
+
+@contextlib.contextmanager
+def locked(path: str | os.PathLike[str], otherwise: str = "") -> Iterator[None]:
+    """Hold an exclusive lock on the file `path` (created, never deleted).
+
+    It waits for others; with `otherwise` never: a lock that another process has is then a Qs3Error
+    in these words.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(path, "ab")  # noqa: SIM115
+    except OSError as error:
+        raise Qs3Error(f"cannot write the lock {path}: {error}") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (fcntl.LOCK_NB if otherwise else 0))
+        except BlockingIOError as error:
+            raise Qs3Error(otherwise) from error
+        yield
+
+
+@contextlib.contextmanager
+def owned(folder: str | Path, doing: str = "training in") -> Iterator[None]:
+    """Own a folder, made if need be, until the block or the process ends; never wait."""
+    path = make_folder(folder) / _LOCK
+    with locked(path, f"another process is {doing} {folder}; wait for it, or choose another one"):
+        yield

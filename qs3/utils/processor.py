@@ -10,7 +10,7 @@ alone, a step is up to a quarter longer.
 import os
 import sys
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 
@@ -36,13 +36,6 @@ def cores() -> list[int]:
 def free_cores() -> int:
     """How many of these are free by the load of the last minute, rounded; at least 1."""
     return max(1, round(len(cores()) - os.getloadavg()[0]))
-
-
-def number_of(threads: int | Literal["auto"] | None) -> int:
-    """`trainer.threads` as a number: null is all cores, "auto" those that are free now."""
-    if threads is None:
-        return len(cores())
-    return free_cores() if threads == "auto" else threads
 
 
 class Moment(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.evaluation.expected import (
+from qs3.evaluation.unlabelled import (
     FEWEST,
     WEIGHT,
     HeldOut,

@@ -13,7 +13,7 @@ import torch
 import trimesh
 
 import qs3
-from qs3.evaluation.prior import read_prior
+from qs3.evaluation.unlabelled import read_prior
 from qs3.geometry.sampling import surface_sample
 from qs3.inference import inputs, model_file
 from qs3.inference.export import export_folder

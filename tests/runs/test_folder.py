@@ -12,7 +12,7 @@ import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config import hashing
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs import folder as runs
-from qs3.utils.locks import owned
+from qs3.utils.files import owned
 
 CONF = Path(__file__).parents[2] / "conf"
 

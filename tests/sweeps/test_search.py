@@ -20,7 +20,7 @@ from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.search import Tried, check_varied, distribution, report, split, words
 from qs3.training.command import judged, objective_of, train
-from qs3.utils.locks import locked
+from qs3.utils.files import locked
 from tests.running import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)

@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
 from qs3.training.run import run_of
-from qs3.utils.locks import owned
+from qs3.utils.files import owned
 from tests.running import command
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
 from tests.training.toy import CONF, overrides

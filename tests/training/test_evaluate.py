@@ -15,7 +15,7 @@ from qs3.datamodules.clouds import load_clouds
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms
-from qs3.evaluation.prior import read_prior
+from qs3.evaluation.unlabelled import read_prior
 from qs3.inference.model_file import read_result
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import read_metrics

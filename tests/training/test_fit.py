@@ -19,7 +19,7 @@ from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, Selec
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training.command import train
 from qs3.training.run import SCALES
-from qs3.utils.locks import owned
+from qs3.utils.files import owned
 from qs3.utils.version import VERSION, commit
 from tests.training.conftest import result_of
 from tests.training.watching import interrupt

@@ -15,7 +15,6 @@ import pytest
 
 from qs3.errors import Qs3Error
 from qs3.utils import files
-from qs3.utils.locks import locked, owned
 
 
 def test_text_and_json(tmp_path):
@@ -86,7 +85,7 @@ def test_kill_9_leaves_old_or_new(tmp_path):
     """A writer alternating between two contents is killed at many instants."""
     code = """
 import sys
-from qs3.utils.files import write_bytes
+from qs3.utils.files import locked, owned, write_bytes
 n = 0
 while True:
     n += 1
@@ -115,10 +114,10 @@ def test_lock_excludes_and_is_released(tmp_path):
     order = []
 
     def second():
-        with locked(tmp_path / "l"):
+        with files.locked(tmp_path / "l"):
             order.append("second")
 
-    with locked(tmp_path / "l"):
+    with files.locked(tmp_path / "l"):
         thread = threading.Thread(target=second)
         thread.start()
         time.sleep(0.05)
@@ -129,10 +128,16 @@ def test_lock_excludes_and_is_released(tmp_path):
 
 def test_a_lock_that_is_held_is_refused_where_it_is_not_waited_for(tmp_path):
     path = tmp_path / "folder" / ".lock"
-    with locked(path):
-        with pytest.raises(Qs3Error, match=r"^busy$"), locked(path, "busy"):
+    with files.locked(path):
+        with pytest.raises(Qs3Error, match=r"^busy$"), files.locked(path, "busy"):
             pass
-        with pytest.raises(Qs3Error, match="another process is training in"), owned(path.parent):
+        with (
+            pytest.raises(Qs3Error, match="another process is training in"),
+            files.owned(path.parent),
+        ):
+            pytest.raises(Qs3Error, match="another process is training in"),
+            files.owned(path.parent),
+        ):
             pass
-    with locked(path, "busy"):
+    with files.locked(path, "busy"):
         assert path.is_file()

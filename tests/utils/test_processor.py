@@ -75,10 +75,8 @@ def test_openmps_threads_sleep_unless_the_environment_sets_it():
         assert said in done.stderr
 
 
-def test_the_number_of_threads(monkeypatch):
-    assert processor.number_of(3) == 3
-    assert processor.number_of(None) == len(processor.cores()) >= 1
+def test_free_cores(monkeypatch):
     monkeypatch.setattr(processor, "cores", lambda: [0, 1])
     for load, free in ((0.1, 2), (1.2, 1), (7.0, 1)):
         monkeypatch.setattr(os, "getloadavg", lambda load=load: (load, 0.0, 0.0))
-        assert processor.number_of("auto") == free
+        assert processor.free_cores() == free
