@@ -61,7 +61,7 @@ def test_files_and_page(run, tmp_path):
         f"<td>{metrics.final.accuracy:.1%}</td>",
         "kinectsim10 (simulated)",
         "python train.py experiment=quickstart",
-        "  epochs: 4",
+        "  epochs: 3",
         f"source_val, epoch {metrics.warmup.selected.epoch + 1}<",
     ):
         assert words in page
@@ -72,9 +72,9 @@ def test_files_and_page(run, tmp_path):
 
 
 def test_curves_are_the_history(run):
-    last = EpochScores(epoch=9, scores=read_metrics(run).final)
-    scores = {"7": 0.1, "8": 0.3, "9": 0.2}
-    student = StudentChoice(rule="snd", epoch=8, score=0.3, scores=scores, held_out=0, last=last)
+    last = EpochScores(epoch=6, scores=read_metrics(run).final)
+    scores = {"4": 0.1, "5": 0.3, "6": 0.2}
+    student = StudentChoice(rule="snd", epoch=5, score=0.3, scores=scores, held_out=0, last=last)
     change(run, student=student)
     rows, axes = table(run / "history.csv"), run_page._curves(read_run(run)).axes
     loss, accuracy = line(axes[0], "train/loss"), line(axes[1], "source_val/acc")
@@ -83,10 +83,10 @@ def test_curves_are_the_history(run):
     np.testing.assert_allclose(accuracy[1], [100 * float(r["source_val/acc"]) for r in rows])
     np.testing.assert_allclose(line(axes[2], "lr")[1], [float(row["lr"]) for row in rows])
     assert texts(axes[0]) == ["warm-up", "0", "1"]
-    assert [p.get_x() for p in axes[0].patches] == [0.5, 7.5]  # warm-up and every other round
+    assert [p.get_x() for p in axes[0].patches] == [0.5, 5.5]  # warm-up and every other round
     teacher = read_metrics(run).warmup.selected.epoch
     assert line(axes[0], f"teacher: epoch {teacher + 1}")[0].tolist() == [teacher + 1] * 2
-    assert line(axes[1], "student: epoch 9")[0].tolist() == [9, 9]
+    assert line(axes[1], "student: epoch 6")[0].tolist() == [6, 6]
 
 
 def test_pseudo_labels_are_those_of_the_tables(run):

@@ -24,7 +24,7 @@ from tests.training.toy import CLASSES, overrides, toy_config, write_domain
 from tests.training.watching import interrupt, seen_by
 
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
-WARMUP, EPOCHS = 6, 3
+WARMUP, EPOCHS = 6, 2
 # The same clouds whoever draws them, so that a process's clouds can be told by their coordinates.
 PLAIN = (
     *("data.points=64", "data.fps_starts=1", "paths.warmup_dir=null"),

@@ -22,8 +22,8 @@ from qs3.training.command import train
 from qs3.utils.seeding import derive
 from tests.training.toy import CLASSES, toy_config
 
-# 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1
-STARTS, ENDS = (0, 4, 7), (3, 6, 9)
+# 7 epochs: 0-2 warm-up, 3-4 round 0, 5-6 round 1
+STARTS, ENDS = (0, 3, 5), (2, 4, 6)
 PERSISTENT = ("selftraining.init=persistent", "selftraining.theta=0.35")
 
 
@@ -105,27 +105,27 @@ def test_the_optimiser_begins_anew(name: str, request: pytest.FixtureRequest) ->
 def test_continued_students_begin_with_their_teacher(continued: Kept) -> None:
     """Round 0 with the selected weights of the warm-up, not its last; round 1 with the student."""
     selected = load(continued.folder / "warmup_selected.pt")
-    assert same(continued.before(4)["weights"], selected)
-    assert same(continued.before(7)["weights"], continued.net(6))
-    assert not same(selected, continued.net(3))
+    assert same(continued.before(3)["weights"], selected)
+    assert same(continued.before(5)["weights"], continued.net(4))
+    assert not same(selected, continued.net(2))
 
 
 def test_a_persistent_student_is_new_in_round_0_and_kept_afterwards(persistent: Kept) -> None:
     """The released code's: the same weights and moments in all rounds."""
     torch.manual_seed(derive(0, "init", 1))
-    assert same(persistent.before(4)["weights"], build(persistent.cfg.model).state_dict())
-    assert persistent.before(4)["moments"] == 0
-    assert same(persistent.before(7)["weights"], persistent.net(6))
-    assert persistent.before(7)["moments"] > 0
-    steps = {e: persistent.checkpoint(e)["optimizer_states"][0]["state"][0]["step"] for e in (6, 7)}
-    assert steps[7] > steps[6] > 0
+    assert same(persistent.before(3)["weights"], build(persistent.cfg.model).state_dict())
+    assert persistent.before(3)["moments"] == 0
+    assert same(persistent.before(5)["weights"], persistent.net(4))
+    assert persistent.before(5)["moments"] > 0
+    steps = {e: persistent.checkpoint(e)["optimizer_states"][0]["state"][0]["step"] for e in (4, 5)}
+    assert steps[5] > steps[4] > 0
 
 
 @pytest.mark.parametrize("name", ["scratch", "continued"])
 def test_checkpoints_hold_what_was_trained(name: str, request: pytest.FixtureRequest) -> None:
     """At the end of a phase, too: steps of its own in the optimiser, trained weights."""
     run: Kept = request.getfixturevalue(name)
-    for epoch in range(10):
+    for epoch in range(7):
         start = max(s for s in STARTS if s <= epoch)
         checkpoint = run.checkpoint(epoch)
         assert checkpoint["epoch"] == epoch
@@ -133,10 +133,10 @@ def test_checkpoints_hold_what_was_trained(name: str, request: pytest.FixtureReq
         batches = sum(len(list(run.kept.glob(f"{e}-*.pt"))) for e in range(start, epoch + 1))
         assert steps == {batches}
         assert not same(run.net(epoch), run.before(start)["weights"])
-        if epoch + 1 not in (*STARTS, 10):  # the next epoch goes on with just these
+        if epoch + 1 not in (*STARTS, 7):  # the next epoch goes on with just these
             assert same(run.net(epoch), run.before(epoch + 1)["weights"])
-    assert same(run.net(9), load(run.folder / "student.pt"))
-    assert same(run.net(3), load(run.folder / "warmup_last.pt"))
+    assert same(run.net(6), load(run.folder / "student.pt"))
+    assert same(run.net(2), load(run.folder / "warmup_last.pt"))
 
 
 def table_by(run: Kept, weights: dict[str, torch.Tensor]) -> list[tuple[str, str, float]]:

@@ -31,19 +31,19 @@ def slow(*values: str):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
-# 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1; 4 batches an epoch of the warm-up
+# 7 epochs: 0-2 warm-up, 3-4 round 0, 5-6 round 1; 4 batches an epoch of the warm-up
 @pytest.mark.parametrize(
     ("hook", "count"),
     [
         ("on_train_start", 1),
         ("on_train_batch_end", 2),  # before the first checkpoint
         slow("on_train_batch_end", 7),  # mid epoch 1
-        slow("on_train_batch_end", 17),  # first epoch of round 0, weights just reset
+        slow("on_train_batch_end", 13),  # first epoch of round 0, weights just reset
         slow("on_validation_batch_end", 3),
-        ("on_train_epoch_start", 5),  # between selection and the first batch of round 0
-        slow("on_train_epoch_end", 4),  # selected, but not yet in a checkpoint
-        ("on_train_epoch_end", 7),
-        slow("on_train_epoch_end", 10),  # last epoch
+        ("on_train_epoch_start", 4),  # between selection and the first batch of round 0
+        slow("on_train_epoch_end", 3),  # selected, but not yet in a checkpoint
+        ("on_train_epoch_end", 5),
+        slow("on_train_epoch_end", 7),  # last epoch
         slow("on_train_end", 1),
     ],
 )
@@ -63,7 +63,7 @@ def test_it_goes_on_with_the_threads_that_it_was_begun_with(toy, monkeypatch):
     """Free cores are counted once: sums are ordered by threads."""
     before = torch.get_num_threads()
     try:
-        cfg = toy("trainer.threads=auto")
+        cfg = toy("trainer.threads=auto", "selftraining=none")
         monkeypatch.setattr(qs3.utils.processor, "free_cores", lambda: 2)
         interrupt(cfg, "on_train_epoch_end", 2)
         assert torch.get_num_threads() == 2
@@ -74,7 +74,7 @@ def test_it_goes_on_with_the_threads_that_it_was_begun_with(toy, monkeypatch):
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("call", [1, slow(4), slow(5), slow(6), slow(10)])
+@pytest.mark.parametrize("call", [1, slow(3), slow(4), slow(5), slow(8)])
 def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, call):
     cfg = toy()
     calls = 0

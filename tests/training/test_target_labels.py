@@ -110,7 +110,6 @@ _LOOK: list[Any] = [None]  # a global, so that the search does not find what it 
 
 CASES = [
     (("method=source_only", "selftraining=none"), False),
-    (("selftraining=none",), True),
     (("selftraining.use_source=true",), True),
     *(((f"selection.student={rule}",), False) for rule in STUDENT_RULES),
     (("method=twin", "selftraining=none"), False),

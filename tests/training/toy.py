@@ -79,7 +79,7 @@ def write_toy(folder: Path) -> None:
 
 def overrides(root: Path, *more: str) -> list[str]:
     """What turns conf/experiment/quickstart.yaml into a toy run in `root`."""
-    rounds = ["rounds=2", "epochs=3", "steps=null", "batch_size=8"]
+    rounds = ["rounds=2", "epochs=2", "steps=null", "batch_size=8"]
     if not any(word.startswith("selftraining.share=0") for word in more):  # which sets it
         rounds.append("theta=0.4")
     return [
@@ -90,7 +90,7 @@ def overrides(root: Path, *more: str) -> list[str]:
         "model._target_=tests.training.toy.TinyNet",
         *(f"~model.{key}" for key in ("k", "variant", "norm", "dropout")),
         "data.points=32",
-        "protocol.epochs=4",
+        "protocol.epochs=3",
         "protocol.steps=null",
         "protocol.optimizer.lr=0.02",
         *(f"selftraining.{x}" for x in rounds if "selftraining=none" not in more),
