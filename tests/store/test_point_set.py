@@ -55,6 +55,12 @@ def test_members_and_counts_of_each_class(tmp_path):
     assert data.labelled is True
 
 
+def test_fewer_clouds_of_each_split_at_even_steps(tmp_path):
+    data = scattered(tmp_path / "d", "0120120", "abaabaa")
+    assert numbers(data.fewer(2)) == [0, 1, 3, 4]  # of 0, 2, 3, 5, 6 and of 1, 4
+    assert numbers(data.fewer(9)) == [*range(7)]
+
+
 def test_clouds_without_classes_have_the_label_minus_1(tmp_path):
     without = [ManifestRow(str(i), "", "train") for i in range(4)]
     failed = [

@@ -148,16 +148,16 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, name, shape):
 
 @pytest.mark.parametrize("bad", [(0,), (1, 2), (3,), (4, 5), (5,)])
 def test_the_first_cloud_that_is_not_finite_is_named(tmp_path, monkeypatch, bad):
-    monkeypatch.setattr(store, "_CHUNK_CLOUDS", 2)
+    monkeypatch.setattr(store, "_CHUNK_CLOUDS", 3)
     points = np.zeros((6, 5, 3), dtype="f4")
     points[list(bad), 4, 1] = np.inf
-    with pytest.raises(DataError):
+    with pytest.raises(DataError, match=f"cloud {bad[0]} "):
         make(tmp_path / "d", arrays={"points": points})
     make(tmp_path / "d", arrays={"points": np.zeros((6, 5, 3))})
     with open(tmp_path / "d" / "points.npy", "r+b") as file:
         file.seek(-points.nbytes, 2)
         file.write(points.tobytes())
-    with pytest.raises(DataError):
+    with pytest.raises(DataError, match=rf"cloud {bad[0]} \(id '{CLASSES[bad[0] % 2]}/{bad[0]}'"):
         open_pointset(tmp_path / "d", verify=False)
 
 
