@@ -5,7 +5,7 @@ import shlex
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.report.running import Job, launch, missing
+from qs3.report.running import missing
 from qs3.report.spec import chosen
 from qs3.report.table import build_table
 from tests.report.filled import run_cell
@@ -49,26 +49,27 @@ def test_what_is_refused(tmp_path, capsys):
         assert "ConfigError" in capsys.readouterr().err
 
 
-def test_a_failure_is_the_exit_status(tmp_path, capfd):
-    (job,) = missing(build_table("cad10", tmp_path), [0], ["dann"])
-    assert launch([Job("bad", (*job.overrides, "num_classes=1"))], "basic", 1, str(tmp_path)) == 1
-    assert "1 of 1 jobs failed" in capfd.readouterr().out
-
-
 def test_a_table_is_trained_kept_and_printed(tmp_path, capfd):
-    """Two cells of a table of one's own, by the commands; a second call trains nothing."""
+    """Two cells of a table of one's own, by the commands; a second call trains nothing.
+
+    A job that fails is the exit status, and stops no other.
+    """
     write_toy(tmp_path / "data")
     toy = [w for w in overrides(tmp_path)[1:] if not w.startswith(("paths.", "selftraining."))]
-    (tmp_path / "own.yaml").write_text(
+    run = "run: experiment=quickstart method=source_only selftraining=none"
+    own = (
         "title: Own\nmetrics: [accuracy]\ncolumns: [T]\nrows:\n"
-        "  - {name: plain, run: experiment=quickstart method=source_only selftraining=none}\n"
-        "  - name: teacher\n    take: warmup\n"
-        "    run: experiment=quickstart method=source_only selftraining=none\n"
+        f"  - {{name: plain, {run}}}\n  - {{name: teacher, take: warmup, {run}}}\n"
     )
+    failing = f"  - {{name: bad, first: true, {run} protocol.smoothing=1}}\n"
+    (tmp_path / "own.yaml").write_text(own + failing)
     words = [f"table={tmp_path / 'own.yaml'}", f"log_dir={tmp_path / 'logs'}"]
     words += [f"data_dir={tmp_path / 'data'}", f"overrides={shlex.join(toy)}"]
-    assert main(["report", "train", *words, "seeds=0,1"]) == 0
-    assert "2 runs to do" in capfd.readouterr().out
+    assert main(["report", "train", *words, "seeds=0,1"]) == 1
+    said = capfd.readouterr().out
+    assert "4 runs to do" in said
+    assert "2 of 4 jobs failed" in said
+    (tmp_path / "own.yaml").write_text(own)
     kept = tmp_path / "own.csv.gz"
     assert main(["report", "keep", *words, f"into={kept}"]) == 0
     first = kept.read_bytes()

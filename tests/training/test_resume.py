@@ -15,7 +15,7 @@ import torch
 import qs3.runs.checkpoints
 import qs3.selftraining.callback
 import qs3.training.command
-import qs3.utils.processor
+import qs3.training.fit
 from qs3.config import hashing
 from qs3.engine.classifier import Classifier
 from qs3.runs.checkpoints import load
@@ -63,11 +63,11 @@ def test_it_goes_on_with_the_threads_that_it_was_begun_with(toy, monkeypatch):
     """Free cores are counted once: sums are ordered by threads."""
     before = torch.get_num_threads()
     try:
-        cfg = toy("trainer.threads=auto", "selftraining=none")
-        monkeypatch.setattr(qs3.utils.processor, "free_cores", lambda: 2)
-        interrupt(cfg, "on_train_epoch_end", 2)
+        cfg = toy("trainer.threads=auto", "selftraining=none", "protocol.epochs=2")
+        monkeypatch.setattr(qs3.training.fit, "free_cores", lambda: 2)
+        interrupt(cfg, "on_train_epoch_start", 2)
         assert torch.get_num_threads() == 2
-        monkeypatch.setattr(qs3.utils.processor, "free_cores", lambda: 1)
+        monkeypatch.setattr(qs3.training.fit, "free_cores", lambda: 1)
         train(cfg)
         assert torch.get_num_threads() == 2
     finally:
