@@ -79,7 +79,7 @@ def generate(cfg: DictConfig) -> PointSet:
         save=partial(save_part, parts),
     )
     with owned(folder, doing="making the dataset in"):
-        renderer = renderer_provenance(job)
+        renderer = renderer_provenance(job, pool)
         recipe = plan.describe(renderer)
         if plan.options.force:  # not before: without a renderer nothing would take its place
             delete_dataset(folder)

@@ -122,11 +122,12 @@ def _name(item_id: str) -> str:
     return hashlib.sha256(item_id.encode()).hexdigest()[:32]
 
 
-def renderer_provenance(job: Job) -> dict[str, str]:
-    """Renderer, variant and versions, asked in a child process."""
+def renderer_provenance(job: Job, pool: Pool) -> dict[str, str]:
+    """Renderer, variant and versions, asked in a child process unless the scans are made here."""
     if not job.recipe.needs_renderer:
         return {}
-    (outcome,) = Processes(1).run(partial(_inspector, job), [("renderer", None)])
+    inspect = partial(_inspector, job)
+    (outcome,) = Processes(min(pool.at_once, 1)).run(inspect, [("renderer", None)])
     if outcome.result is None:
         raise RenderError("the renderer's process died at its start: see `qs3 doctor`")
     provenance, found_out = outcome.result

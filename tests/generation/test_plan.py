@@ -55,9 +55,10 @@ def code(tmp_path):
     return tmp_path
 
 
-def test_so_does_code_but_not_words(code):
-    digits = code_fingerprint()
-    assert code_fingerprint(code) == digits
+def test_so_does_code_but_not_words(code, monkeypatch):
+    assert code_fingerprint(code) == code_fingerprint()
+    monkeypatch.setattr("qs3.generation.plan.MAKES_CLOUDS", ("meshes", "sensors/optics"))
+    digits = code_fingerprint.__wrapped__(code)
     file = code / "sensors" / "optics" / "patterns.py"
     text = file.read_text()
     file.write_text(f'{text}\n\ndef _f() -> int:\n    """Words."""\n    return 1  # a comment\n')
