@@ -97,7 +97,11 @@ def _modules(net: PointClassifier, name: str) -> list[nn.Module]:
     return [part for part in (*parts, net.head) if part is not None]
 
 
-@pytest.mark.parametrize(("name", "variant", "training"), PUBLISHED)
+LARGEST = ("pointnet2", "msg", True)
+EACH = [pytest.param(*k, marks=pytest.mark.slow if k == LARGEST else ()) for k in PUBLISHED]
+
+
+@pytest.mark.parametrize(("name", "variant", "training"), EACH)
 def test_logits_and_gradients_are_the_authors(name: str, variant: str, training: bool) -> None:
     build = {"dgcnn": dgcnn, "pointnet": pointnet, "pointnet2": pointnet2}[name]
     net = build(10, variant=variant, dropout=0.0).double().train(training)
