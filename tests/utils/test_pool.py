@@ -8,45 +8,12 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from joblib import Parallel, delayed
 
 from qs3.errors import DataError
 from qs3.utils.pool import Processes, _held_back
-
-
-class Strange(Exception):
-    """Cannot be made again from what a pickle keeps of it."""
-
-    def __init__(self, a, b):
-        super().__init__(f"{a} and {b}")
-
-
-def work(task):
-    what, value = task
-    match what:
-        case "square":
-            return value * value
-        case "kill":
-            os.kill(os.getpid(), signal.SIGKILL)
-        case "kill once":
-            if not value.exists():
-                value.touch()
-                os.kill(os.getpid(), signal.SIGKILL)
-            return "survived"
-        case "raise":
-            raise value
-        case "raise strange":
-            raise Strange(1, 2)
-        case "pid":
-            return os.getpid()
-        case "large":
-            return np.zeros(value)
-
-
-def make():
-    return work
+from tests.utils.pool_work import die_at_once, make, no_worker, pids_in_a_job
 
 
 def run(tasks, workers=2, **settings):
@@ -77,17 +44,9 @@ def test_a_deadly_task_costs_only_itself_and_an_unlucky_one_nothing(tmp_path):
     }
 
 
-def die_at_once():
-    os._exit(3)
-
-
 @pytest.mark.slow
 def test_a_worker_that_cannot_start_is_the_death_of_each_task():
     assert all(o.died for o in Processes(2).run(die_at_once, squares(3)))
-
-
-def no_worker():
-    raise DataError("no licence")
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -121,11 +80,11 @@ def test_tasks_are_taken_when_somebody_is_free_and_large_messages_pass():
     def tasks():
         for i in range(8):
             taken.append(i)
-            yield str(i), ("large", 1_000_000)
+            yield str(i), ("large", 8_000_000)
 
     outcomes = Processes(2).run(make, tasks())
     first = next(outcomes)
-    assert first.result.shape == (1_000_000,)
+    assert len(first.result) == 8_000_000
     assert len(taken) <= 4
     assert len(list(outcomes)) == 7
 
@@ -145,17 +104,10 @@ def test_whoever_stops_taking_outcomes_leaves_no_process():
     assert not any(map(alive, pids))
 
 
-def sleep(seconds):
-    time.sleep(seconds)
-
-
-def make_sleepers():
-    return sleep
-
-
 SCRIPT = """
 import signal
-from tests.utils.test_pool import Processes, make_sleepers
+from qs3.utils.pool import Processes
+from tests.utils.pool_work import make_sleepers
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if tests run behind an &
     list(Processes(2).run(make_sleepers, [("a", 600), ("b", 600), ("c", 600)]))
@@ -185,22 +137,13 @@ def test_processes_end_with_their_parent_while_they_work(tmp_path, how):
     try:
         assert until(lambda: len(children(process.pid)) >= 3)  # two workers, a resource tracker
         workers = children(process.pid)
-        time.sleep(1)  # they are at work, or about to be
+        time.sleep(0.5)  # they are at work, or about to be
         process.send_signal(how)
         _, errors = process.communicate(timeout=60)
     finally:
         process.kill()
     assert until(lambda: not any(map(alive, workers)))
     assert errors.count("Traceback") == (how == signal.SIGINT)  # the parent's
-
-
-def pids_in_a_job(tasks):
-    """In a process of joblib's, as a run of a sweep is."""
-    import multiprocessing
-
-    before = multiprocessing.get_start_method()
-    found = list(Processes(2).run(make, tasks))
-    return before, multiprocessing.get_start_method(), found
 
 
 def test_processes_start_in_a_job_of_joblibs(capfd):
@@ -214,7 +157,7 @@ def test_processes_start_in_a_job_of_joblibs(capfd):
 
 UNGUARDED = """
 from qs3.utils.pool import Processes
-from tests.utils.test_pool import make
+from tests.utils.pool_work import make
 print("begun")
 print([outcome.result for outcome in Processes(2).run(make, [("a", ("square", 3))])])
 """
