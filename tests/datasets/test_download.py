@@ -67,7 +67,7 @@ def zipped(folder):
     return memory.getvalue()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def speckle(tmp_path_factory):
     """SpeckleNet10 as an archive with a folder too many, a list and Mac OS's companions."""
     folder = tmp_path_factory.mktemp("author")
@@ -162,7 +162,7 @@ def test_archives_with_no_tree_or_several(site, tmp_path, tmp_path_factory):
         get(site, "specklenet10", tmp_path)
     assert visible(tmp_path / "published") == []
     for name in ("noisy", "clean"):
-        fixtures.write_tree(folder / name, SPLITS)
+        fixtures.write_tree(folder / name, SPLITS, points=16)
     (tmp_path / "own.zip").write_bytes(zipped(folder))
     words = ["download", "specklenet10", f"into={tmp_path}", f"archive={tmp_path / 'own.zip'}"]
     assert main(words) == 1

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from qs3.datamodules.domain import DomainData
-from qs3.datasets.domain import compose_domain
 from qs3.errors import DataError
 from qs3.store.meta import is_finished, read_manifest
+from tests.composing import compose_domain
 from tests.fixtures.frame_files import write_archive
 
 

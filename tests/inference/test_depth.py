@@ -26,6 +26,8 @@ SHOT = Shot(
     ],
     pitch_deg=14,
     roll_deg=3,
+    camera=(259.0, 259.5, 162.0, 126.0),
+    size=(240, 320),
 )
 CAMERA = ",".join(map(str, SHOT.camera))
 UP = "up=" + ",".join(map(str, SHOT.up_in_camera))

@@ -247,8 +247,8 @@ def test_what_comes_with_qs3_is_whole_and_knows_scans_of_meshes_it_never_saw():
         predictor = qs3.load(name)
         assert predictor.classes == CLASSES
         floor = 0.0 if predictor.needs_floor else None
-        found = predictor(sample["points"][::4].astype(np.float32), floor=floor)
-        right = np.mean(np.array(CLASSES)[found.argmax(axis=1)] == truth[::4])
+        found = predictor(sample["points"][::10].astype(np.float32), floor=floor)
+        right = np.mean(np.array(CLASSES)[found.argmax(axis=1)] == truth[::10])
         assert right > 0.6, name
         assert predictor.result.held_out.accuracy > 0.6
         assert "On real objects of `nyuv2_train_objects.npz`" in (

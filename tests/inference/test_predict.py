@@ -222,7 +222,12 @@ def test_names_for_terminals_and_pages_are_printable(run, clouds, tmp_path, caps
 def test_a_prior_is_that_of_python(run, clouds, tmp_path):
     np.save(tmp_path / "a.npy", clouds)
     out = tmp_path / "said.csv"
-    assert predict(run, out, str(tmp_path / "a.npy"), "prior=rod:8,ball:0", "prior_power=1") == 0
+    assert (
+        predict(
+            run, out, str(tmp_path / "a.npy"), "page=false", "prior=rod:8,ball:0", "prior_power=1"
+        )
+        == 0
+    )
     given = {"rod": 8, "ball": 0}
     expected = qs3.load(run, prior=given, prior_power=1)(clouds)
     np.testing.assert_allclose([probabilities(row) for row in table(out)], expected, atol=1e-6)
@@ -237,14 +242,14 @@ def test_how_many_are_expected_right(run, clouds, tmp_path, capsys):
     np.save(tmp_path / "a.npy", np.concatenate([clouds, clouds]))
     np.save(tmp_path / "few.npy", clouds[:20])
     out, shares = tmp_path / "said.csv", []
-    for words in ([], ["prior=rod:8"]):
+    for words in (["prior=rod:8", "page=false"], []):
         assert predict(run, out, str(tmp_path / "a.npy"), *words) == 0
         said = re.search(r"\nabout (\d+)% expected right \(±11\)\n", capsys.readouterr().out)
         shares.append(int(said[1]))
     assert 0 < shares[0] <= 100 * read_result(run).held_out.accuracy + 0.5
     assert shares[0] == shares[1]
     assert "expected right" in out.with_suffix(".html").read_text()
-    assert predict(run, out, str(tmp_path / "few.npy")) == 0
+    assert predict(run, out, str(tmp_path / "few.npy"), "page=false") == 0
     assert "expected right" not in capsys.readouterr().out
 
 
@@ -264,7 +269,7 @@ def test_a_second_classifier_is_asked_and_counted(run, clouds, tmp_path, capsys)
     assert predict(run, out, *words, f"second={run}") == 0
     assert "agrees on 6 (50% right), differs on 0 (column second)" in capsys.readouterr().out
     assert DISPUTED not in out.with_suffix(".html").read_text()
-    assert predict(run, out, *words) == 0
+    assert predict(run, out, *words, "page=false") == 0
     assert "second classifier" not in capsys.readouterr().out
     write_result(tmp_path / "more.pt", replace(other, classes=("slab", "ball", "cup")))
     assert predict(run, out, *words, f"second={tmp_path}/more.pt") == 1
@@ -296,7 +301,7 @@ def test_without_a_name_the_floor_decides(run, high_net, tmp_path, monkeypatch, 
 
 def test_an_archive_with_labels_shows_right_and_wrong(run, tmp_path, capsys):
     """Its classes are ten; of three of them the net's names are put in."""
-    arrays = write_archive(tmp_path / "objects.npz", {"train": 4, "test": 2})
+    arrays = write_archive(tmp_path / "objects.npz", {"train": 3, "test": 1}, points=90)
     ours = dict(zip(CLASSES, ["ball", "rod", "slab", "ball"], strict=False))
     arrays["cls"] = np.array([ours.get(cls, cls) for cls in arrays["cls"].tolist()])
     arrays["occ"][arrays["tier"] == "hard"] = 0.3
