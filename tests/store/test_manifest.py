@@ -70,7 +70,7 @@ def test_a_wrong_value_names_the_line(tmp_path, line, column, value):
         open_pointset(tmp_path / "d")
 
 
-@pytest.mark.parametrize("text", ["", 'index,"id', "index,id\n"])
+@pytest.mark.parametrize("text", ["", 'index,"id', "index,id\n", "z\n"])
 def test_what_is_not_a_manifest(tmp_path, text):
     make(tmp_path / "d")
     (tmp_path / "d" / "manifest.csv").write_text(text)
@@ -94,7 +94,8 @@ def test_as_written(tmp_path):
 def test_without_them_nothing_is_added(tmp_path):
     text = to_csv(rows({}, {}))
     assert text.splitlines()[0].endswith("status,reason")
-    (tmp_path / "manifest.csv").write_text(text.replace("status,reason", "status,reason,id"))
+    twice = "\n".join(line + ",id" for line in text.splitlines())
+    (tmp_path / "manifest.csv").write_text(twice)
     with pytest.raises(DataError):
         read_manifest(tmp_path, ["chair"])
     (tmp_path / "manifest.csv").write_text(text.replace("status,reason", "status,reason,tier"))

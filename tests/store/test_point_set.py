@@ -107,3 +107,14 @@ def test_clouds_of_a_dataset_cannot_be_put_in_place_of_others(tmp_path):
     assert data != dataclasses.replace(data)  # arrays have no single truth to compare
     meta = {"made_of": {"objects": "arrays of x.npz"}}
     assert str(make(tmp_path / "e", meta=meta).made_of) == str(MadeOf.of(meta))
+
+
+def test_what_a_dataset_is_made_of_in_words():
+    full = MadeOf(objects="o", sensor="s", views=2, without="lamp", benchmark="b v2")
+    assert str(full) == "o, s, 2 views, without lamp, b v2"
+    assert str(dataclasses.replace(full, views=1)) == "o, s, 1 view, without lamp, b v2"
+    assert str(MadeOf(objects="o")) == "o"
+    assert MadeOf.of(full.meta) == full != MadeOf.of({})
+    assert not MadeOf().published
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        full.views = 3

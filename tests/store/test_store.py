@@ -98,6 +98,7 @@ def test_meta_as_people_read_it(tmp_path):
         *("failed", "sha256", "zebra", "apple"),
     ]  # nothing is said of tables where there are none
     assert "Größe" in text
+    assert "format_version: 1\n" in text
     assert 90 < max(map(len, text.splitlines()[:-1])) <= 105  # folded at the first word after 100
 
 
