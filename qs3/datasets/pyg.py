@@ -96,8 +96,8 @@ def from_pyg(
     clouds, rows = [], []
     for (split, number, one), y in zip(taken, labels, strict=True):
         pos = one.pos.detach().cpu().numpy().astype(np.float32)
-        points = len(pos) if points is None else points
-        clouds.append(pos[farthest_point_sampling_np(pos, points)] if len(pos) > points else pos)
+        most = len(pos) if points is None else points
+        clouds.append(pos[farthest_point_sampling_np(pos, most)] if len(pos) > most else pos)
         cls, key = "" if y is None else names[y], getattr(one, "id", None)
         if not key or not isinstance(key, str):
             key = f"{cls or 'cloud'}/{split}/{number:06d}"
