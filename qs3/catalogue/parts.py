@@ -203,7 +203,6 @@ def sweep(
     *,
     scale: Sequence[float] | np.ndarray | None = None,
     up: Vector = (0, 0, 1),
-    loop: bool = False,
 ) -> Mesh:
     """A star-shaped section [N, 2] carried along a path [K, 3] without twist.
 
@@ -211,10 +210,7 @@ def sweep(
     first is tangent x up. `scale` enlarges the section at each point of the path.
     """
     path = np.asarray(path, dtype=np.float64)
-    if loop:
-        steps = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0)
-    else:
-        steps = np.gradient(path, axis=0)
+    steps = np.gradient(path, axis=0)
     tangents = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     normal = _perpendicular(np.asarray(up, dtype=np.float64), tangents[0])
     factors = np.ones(len(path)) if scale is None else np.asarray(scale, dtype=np.float64)
@@ -224,7 +220,7 @@ def sweep(
         side = np.cross(tangent, normal)
         flat = section * factor
         rings.append(point + flat[:, :1] * side + flat[:, 1:] * normal)
-    return loft(np.stack(rings), loop=loop)
+    return loft(np.stack(rings))
 
 
 def _perpendicular(vector: np.ndarray, tangent: np.ndarray) -> np.ndarray:
@@ -241,10 +237,9 @@ def tube(
     *,
     scale: Sequence[float] | np.ndarray | None = None,
     sides: int = 8,
-    loop: bool = False,
 ) -> Mesh:
     """A round bar along a path [K, 3]; `scale` multiplies the radius along it."""
-    return sweep(ellipse(2 * radius, 2 * radius, sides), path, scale=scale, loop=loop)
+    return sweep(ellipse(2 * radius, 2 * radius, sides), path, scale=scale)
 
 
 def rod(p: Vector, q: Vector, radius: float, end: float | None = None, sides: int = 10) -> Mesh:
