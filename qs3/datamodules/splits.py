@@ -4,7 +4,6 @@ Further scans of an object (`generate.py scans=N` calls them id~1, id~2, ...) go
 else training would see the validation shapes.
 """
 
-import re
 from collections.abc import Sequence
 from types import MappingProxyType
 
@@ -12,12 +11,11 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.errors import DataError
+from qs3.store.meta import FURTHER_SCAN
 from qs3.utils.seeding import derive
 
 STRATIFIED_SEED = 0
 STRATIFIED_SHARE = 0.2  # of each class's objects, as large as the lineage's part
-
-_FURTHER_SCAN = re.compile(r"~\d+$")
 
 
 def lineage(
@@ -69,7 +67,7 @@ def stratified(
 
 def _objects(ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """The objects' names, sorted, and of each cloud which object it shows."""
-    return np.unique([_FURTHER_SCAN.sub("", name) for name in ids], return_inverse=True)
+    return np.unique([FURTHER_SCAN.sub("", name) for name in ids], return_inverse=True)
 
 
 RULES = MappingProxyType({"lineage": lineage, "stratified": stratified})

@@ -7,7 +7,6 @@ as `generate.py scans=N` does). Each is as it is stored: coordinates are not sca
 import dataclasses
 import functools
 import hashlib
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import field
@@ -18,11 +17,9 @@ import numpy as np
 
 from qs3.datasets.importing import Importer, Item, by_class
 from qs3.errors import DataError
-from qs3.store.meta import META, OK, MadeOf, read_manifest
+from qs3.store.meta import FURTHER_SCAN, META, OK, MadeOf, read_manifest
 from qs3.store.store import open_pointset
 from qs3.utils.settings import settings
-
-_FURTHER_SCAN = re.compile(r"~\d+$")
 
 
 @settings
@@ -76,7 +73,7 @@ class Joined(Importer):
                 )
             kept = (row for row in read_manifest(folder, data.classes) if row.status == OK)
             for i, row in enumerate(kept):
-                object_ = _FURTHER_SCAN.sub("", row.id)
+                object_ = FURTHER_SCAN.sub("", row.id)
                 number = scans[object_]
                 scans[object_] += 1
                 row = dataclasses.replace(

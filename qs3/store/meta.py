@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 import io
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,9 @@ OK = "ok"
 
 SPLITS: tuple[str, ...] = ("train", "validation", "test")
 """The splits a manifest may name; ShapeNet10 alone has all three."""
+
+FURTHER_SCAN = re.compile(r"~\d+$")
+"""How the ids of an object's further scans end."""
 
 AGAIN = "delete the folder and generate or import the dataset again"
 _FORMAT = {"format": "qs3 point clouds", "format_version": 1}
