@@ -4,10 +4,10 @@
                 semicolons; # and // begin a comment. A first row of names, also as a comment,
                 says which columns are x, y and z
     .npy        [n, >= 3], or [m, n, >= 3]: m clouds
-    .npz        the array `points` (or the only one) as in .npy; perhaps `label` or `cls`
+    .npz        the array `points` (or the only one) as in .npy; perhaps `cls`, `label` or `labels`
     .ply        the vertices, text or binary; faces are passed over
     .pcd        x y z
-    .h5 .hdf5   the dataset `data` or `points` as in .npy; perhaps `label`
+    .h5 .hdf5   the dataset `data` or `points` as in .npy; perhaps `label` or `labels`
 
 Only x y z are read. Pickled arrays are refused unopened.
 """

@@ -1,1 +1,1 @@
-"""The LightningModule, its schedules and loggers, and the trainer that runs it."""
+"""The LightningModule, and its checkpoints, loggers and CUDA graphs."""

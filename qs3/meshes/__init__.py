@@ -1,1 +1,1 @@
-"""Meshes: files, folders, and the embedded catalogue."""
+"""Meshes: files, folders of them, and how an object is placed."""

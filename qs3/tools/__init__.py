@@ -1,1 +1,1 @@
-"""Quickstart, doctor, and a toy problem for demonstrations."""
+"""A toy problem, for tests and demonstrations."""

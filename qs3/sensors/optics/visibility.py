@@ -16,7 +16,7 @@ from qs3.sensors.renderers.base import Body, Projector, Renderer, Scene
 
 
 class Reason(IntEnum):
-    """One for each pixel; what comes first in this list wins where several hold."""
+    """One for each pixel; where several hold, the sensor decides (`first_reason`)."""
 
     OK = 0  # it has a depth
     EMPTY = 1  # no surface there, or none in reach

@@ -1,4 +1,4 @@
-"""All bodies of a scene as one mesh, and what a pixel sees of it."""
+"""All bodies of a scene as one mesh, what a pixel sees of it, and Mitsuba's compiled kernel."""
 
 from __future__ import annotations
 
