@@ -211,10 +211,10 @@ def _device(name: str, flat: pd.DataFrame, facing: pd.DataFrame) -> Iterator[_Ro
         near = facing[facing.depth_m <= max(_D435_M)]
         yield "sub-pixel RMS, px", _farthest(near.subpixel_rms_px, (low + high) / 2), low, high
     if "d435" in name:
-        asked = facing[facing.depth_m.isin(_D435_M)]
+        near = facing[facing.depth_m.isin(_D435_M)]
         # Axial noise as measured by L. Kotsonis (elevation_mapping, 0.2 to 3.25 m).
-        kotsonis_m = 0.000611 + 0.003587 * (asked.depth_m - 0.3515) ** 2
-        ratio = np.log(asked.sigma_m / kotsonis_m)
+        kotsonis_m = 0.000611 + 0.003587 * (near.depth_m - 0.3515) ** 2
+        ratio = np.log(near.sigma_m / kotsonis_m)
         yield "sigma_Z over a real D435's (Kotsonis)", float(np.exp(_farthest(ratio, 0))), 0.7, 1.3
     for tilt, (low, high) in _FILL_TILTED.items():
         if "d4" in name and (flat.tilt_deg == tilt).any():  # a quick bench leaves them out

@@ -175,10 +175,10 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
         ray.init(address=how.address, **local, **quiet)
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         log.info("Ray: %d nodes, %d cores", len(nodes), ray.cluster_resources().get("CPU", 0))
-        asked = {"CPU": how.cpus, "GPU": how.gpus, "memory": how.memory_bytes}
+        needs = {"CPU": how.cpus, "GPU": how.gpus, "memory": how.memory_bytes}
         # Else Ray would wait for ever.
-        if not any(all(has.get(k, 0) >= n for k, n in asked.items()) for has in nodes):
-            raise ConfigError(f"no node of the cluster has what a task asks for: {asked}")
+        if not any(all(has.get(k, 0) >= n for k, n in needs.items()) for has in nodes):
+            raise ConfigError(f"no node of the cluster has what a task asks for: {needs}")
         yield
     finally:
         ray.shutdown()

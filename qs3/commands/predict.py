@@ -82,7 +82,7 @@ def predict(
     how |= {"prior": prior or None, "prior_power": prior_power}
     first = load(name, **how)
     other = second or ("none" if ckpt else model_file.SECOND)
-    asked = None if other == "none" else steps.second_opinion(other, first, floor, **how)
+    opinion = None if other == "none" else steps.second_opinion(other, first, floor, **how)
     if depth is None:
         assert input is not None
         found = inputs.clouds(input, up or "z", part, first.classes)
@@ -91,8 +91,8 @@ def predict(
         found = inputs.depth_images(*pictures)
     samples, shown, began = [], [], time.monotonic()
     with progress_bar(f"{found.kind}s read", total=len(found.units)) as advance:
-        told = (first.floor(floor), asked, batch_size, threads or len(cores()), advance)
-        for one in steps.predict_units(first, found.units, *told):
+        settings = (first.floor(floor), opinion, batch_size, threads or len(cores()), advance)
+        for one in steps.predict_units(first, found.units, *settings):
             samples.append(one)
             shown += [one] * bool(one.cls)
             if len(shown) > pages.MOST_SHOWN + batch_size:

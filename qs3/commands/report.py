@@ -86,8 +86,8 @@ def table(build: Callable[..., Table], *, out: _Out = None) -> None:
     from qs3.report.formats import csv_text, markdown, save, text
 
     found = build()
-    said = save(_place(found, out), {".md": markdown(found), ".csv": csv_text(found)})
-    print(text(found), f"runs lie in {found.log_dir}; {said}", sep="\n")
+    saved = save(_place(found, out), {".md": markdown(found), ".csv": csv_text(found)})
+    print(text(found), f"runs lie in {found.log_dir}; {saved}", sep="\n")
 
 
 @_of_table
@@ -224,8 +224,8 @@ def leaderboard(
     found = first_row(build(rows=[row]), row["name"])
     text = page(found, row["name"])
     place = _place(found, out, "".join(c if c.isalnum() else "-" for c in row["name"]))
-    said = save(place, {".md": text, ".csv": csv_text(found)})
-    print(text, said, sep="\n")
+    saved = save(place, {".md": text, ".csv": csv_text(found)})
+    print(text, saved, sep="\n")
     return status
 
 

@@ -199,8 +199,8 @@ class Classifier(LightningModule):
             net = self._graphs.stand_in
         begins = batch_idx % self.trainer.accumulate_grad_batches == 0
         done = self.current_epoch + (batch_idx + 1) / int(self.trainer.num_training_batches)
-        told = {"progress": min(done / self.phases.warmup, 1.0), "step_begins": begins}
-        terms = method.loss(net, {**batch, **told}, generator)
+        step = {"progress": min(done / self.phases.warmup, 1.0), "step_begins": begins}
+        terms = method.loss(net, {**batch, **step}, generator)
         total = total_loss(method, terms)
         if self._regularisers:
             total = total + self.regulariser_weight * torch.stack(self._regularisers).sum()

@@ -35,7 +35,7 @@ class EpochRows(Callback):
 
     def __init__(self, folder: Path, phases: Phases) -> None:
         self.file, self.phases = folder / HISTORY, phases
-        self._said = time.monotonic()
+        self._logged = time.monotonic()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Send the rows of the epochs before this start to the offline logs, which lack them."""
@@ -64,11 +64,11 @@ class EpochRows(Callback):
         write_text(self.file, text.getvalue())
         for logger in trainer.loggers:
             logger.log_metrics(row, step=epoch)
-        if self.phases.ends(epoch) or time.monotonic() - self._said > _SECONDS:
-            self._said = time.monotonic()
+        if self.phases.ends(epoch) or time.monotonic() - self._logged > _SECONDS:
+            self._logged = time.monotonic()
             name = "warm-up" if phase == 0 else f"round {phase - 1} of {self.phases.rounds}"
-            said = ", ".join(f"{key} {value:.3f}" for key, value in figures.items())
-            log.info("epoch %d of %d: %s, %s", epoch + 1, trainer.max_epochs, name, said)
+            shown = ", ".join(f"{key} {value:.3f}" for key, value in figures.items())
+            log.info("epoch %d of %d: %s, %s", epoch + 1, trainer.max_epochs, name, shown)
 
     def _rows(self, before: int) -> list[dict[str, str]]:
         """Those of earlier epochs, as written."""

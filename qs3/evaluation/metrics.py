@@ -29,8 +29,8 @@ def predict(
     *,
     domain: str = "target",
 ) -> Float[np.ndarray, "n c"]:
-    """Class probabilities of `said_of`, float64."""
-    (logits,) = said_of(net, lambda x: (net(x),), points, batch_size, device, domain=domain)
+    """Class probabilities of `outputs_of`, float64."""
+    (logits,) = outputs_of(net, lambda x: (net(x),), points, batch_size, device, domain=domain)
     return logits.softmax(dim=1).numpy()
 
 
@@ -42,17 +42,17 @@ def global_features(
     *,
     domain: str = "target",
 ) -> Float[np.ndarray, "n d"]:
-    """The backbone's features of each cloud, float64, as `said_of`."""
+    """The backbone's features of each cloud, float64, as `outputs_of`."""
     if not hasattr(net, "features"):
         raise ConfigError(f"{type(net).__name__} has no features; choose e.g. model=dgcnn")
-    features = said_of(
+    features = outputs_of(
         net, lambda x: (net.features(x).global_,), points, batch_size, device, domain=domain
     )
     return features[0].numpy()
 
 
 @torch.no_grad()
-def said_of(
+def outputs_of(
     net: nn.Module,
     of_batch: Callable[[Tensor], tuple[Tensor, ...]],
     points: Float[Tensor, "n p 3"],

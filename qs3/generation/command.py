@@ -122,11 +122,11 @@ def _check_place(domain: Domain, force: bool) -> None:
 def _judge_failed(plan: Plan, pointset: PointSet) -> None:
     """Warn of the objects that a dataset lacks; with strict=true they are an error."""
     failed = len(plan.items) - len(pointset.ids)
-    said = f"{failed} of {len(plan.items)} objects failed; see {plan.domain.folder / MANIFEST}"
+    problem = f"{failed} of {len(plan.items)} objects failed; see {plan.domain.folder / MANIFEST}"
     if failed and plan.options.strict:
-        raise DataError(said)
+        raise DataError(problem)
     if failed:
-        log.warning("%s", said)
+        log.warning("%s", problem)
 
 
 def _begin(parts: PartFiles, recipe: dict[str, Any]) -> None:

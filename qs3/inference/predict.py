@@ -165,12 +165,12 @@ def _scored(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
 
 def _agreement(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
     """How often a second classifier agrees, and, with labels, what that was worth."""
-    asked = [one for one in samples if one.second]
+    both = [one for one in samples if one.second]
     parts = []
     for words, differs in (("agrees on", False), ("differs on", True)):
-        some = [one for one in asked if disputed(one) is differs]
+        some = [one for one in both if disputed(one) is differs]
         judged = [one.cls == one.label for one in some if one.label in classes]
         share = f" ({np.mean(judged):.0%} right)" if judged else ""
         parts.append(f"{words} {len(some)}{share}")
     line = f"a second classifier {', '.join(parts)} (column second); inspect disagreements"
-    return [line] if asked else []
+    return [line] if both else []

@@ -81,8 +81,8 @@ class Scores:
 
 def scores(samples: Sequence[Sample], classes: Sequence[str]) -> Scores | None:
     """The figures; None if no sample has both a prediction and a label of the net's classes."""
-    said = [one for one in samples if one.cls]
-    judged = [one for one in said if one.label in classes]
+    predicted = [one for one in samples if one.cls]
+    judged = [one for one in predicted if one.label in classes]
     if not judged:
         return None
 
@@ -112,6 +112,6 @@ def scores(samples: Sequence[Sample], classes: Sequence[str]) -> Scores | None:
             for kind, _ in every.most_common()
         },
         confusion,
-        dict(Counter(one.label for one in said if one.label and one.label not in classes)),
-        sum(not one.label for one in said),
+        dict(Counter(one.label for one in predicted if one.label and one.label not in classes)),
+        sum(not one.label for one in predicted),
     )

@@ -92,17 +92,17 @@ def judge(
         raise ConfigError(f"{data} has no objects of {', '.join(common)} in what was asked for")
     clouds = [archive.cloud(i) for i in kept]
     shown = [f"{data.name}[{i}]" for i in kept]
-    called = {}
+    predicted = {}
     with progress_bar("judging runs", total=len(nets)) as advance:
         for file, net in nets.items():
             place = [common.index(name) if name in common else -1 for name in net.classes]
-            called[file] = np.array(place)[net(clouds, names=shown, floor=floor).argmax(axis=1)]
+            predicted[file] = np.array(place)[net(clouds, names=shown, floor=floor).argmax(axis=1)]
             advance()
     truth = np.array([common.index(str(names[i])) for i in kept])
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
     subsets = {"all": np.ones(len(kept), dtype=bool)}
     subsets |= {tier: tiers == tier for tier in TIERS if (tiers == tier).any()}
-    right = [np.stack([called[f] == truth for f in one.runs.values()]) for one in families]
+    right = [np.stack([predicted[f] == truth for f in one.runs.values()]) for one in families]
     rows = []
     for family, mine in zip(families, right, strict=True):
         more = _less(family, mine, families[0], right[0])

@@ -66,9 +66,9 @@ def drawn(positions: np.ndarray, most: int, seed: int = 0) -> list[int]:
     return sorted(np.random.default_rng(seed).choice(positions, most, replace=False).tolist())
 
 
-def points_each(clouds: int, asked: int | None) -> int:
-    """How many points each of so many clouds has: `asked`, else what keeps a page small."""
-    return asked or min(_USUAL // max(clouds, 1), _USUAL_CLOUD)
+def points_each(clouds: int, given: int | None) -> int:
+    """How many points each of so many clouds has: `given`, else what keeps a page small."""
+    return given or min(_USUAL // max(clouds, 1), _USUAL_CLOUD)
 
 
 def thinned(one: Shown, most: int) -> Shown:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
-from qs3.evaluation.metrics import said_of
+from qs3.evaluation.metrics import outputs_of
 from qs3.kernels.norms import begin_target_norms, use_domain
 from qs3.methods.base import Method, Weight, class_loss
 from qs3.selftraining.selectors import (
@@ -130,17 +130,17 @@ class Pcfea(Method):
         labels = data.labelled.labels.numpy()
         f, p = _features(net, data.labelled.clouds.points, size, "source", self.mean.device)
         g, q = _features(net, data.target.points, size, "target", self.mean.device)
-        said = TeacherPredictions.of(q, data.target.ids)
-        named = said.predicted
+        teacher = TeacherPredictions.of(q, data.target.ids)
+        named = teacher.predicted
         progress = (epoch - first) / (epochs - first)
         own, ids = p[np.arange(len(p)), labels], data.labelled.ids
         of_source = most_confident(own, labels, 1 - progress, ids, doubts(p, labels))
         if self.selector is None:
             of_target = most_confident(
-                said.confidence, named, progress, data.target.ids, said.doubt
+                teacher.confidence, named, progress, data.target.ids, teacher.doubt
             )
         else:
-            chosen = chosen_by(self.selector, said, self.theta, (epoch - first) // between)
+            chosen = chosen_by(self.selector, teacher, self.theta, (epoch - first) // between)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels
         source_mean, _ = moments(f, torch.from_numpy(labels), classes)
         pool = torch.cat([f[torch.from_numpy(of_source)], g[torch.from_numpy(of_target)]])
@@ -208,5 +208,5 @@ def _features(
     net: nn.Module, points: Tensor, size: int, domain: str, device: Any
 ) -> tuple[Float[Tensor, "n d"], Float[np.ndarray, "n c"]]:
     """`penultimate` of all clouds in eval mode, float64 on the CPU, and class probabilities."""
-    f, z = said_of(net, lambda x: penultimate(net, x), points, size, device, domain=domain)
+    f, z = outputs_of(net, lambda x: penultimate(net, x), points, size, device, domain=domain)
     return f, z.softmax(dim=1).numpy()

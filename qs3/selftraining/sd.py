@@ -91,11 +91,11 @@ class GraphRefined:
         order = np.argsort(np.asarray(teacher.ids), kind="stable")  # whatever that of the rows
         features = torch.from_numpy(teacher.features[order]).double()
         edges = neighbours_of(features, self.correlation, self.neighbours)
-        said = torch.from_numpy(teacher.probabilities[order]).float()
+        given = torch.from_numpy(teacher.probabilities[order]).float()
         seed = derive(self.seed, "graph", round_)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            refined = _refined(principal(features, WIDTH).float(), said, edges, self.steps)
+            refined = _refined(principal(features, WIDTH).float(), given, edges, self.steps)
         scores = np.empty_like(teacher.probabilities)
         scores[order] = refined.numpy()
         return scores
@@ -158,18 +158,18 @@ class GraphNet(nn.Module):
 
 
 def _refined(
-    features: Float[Tensor, "n d"], said: Float[Tensor, "n k"], edges: Tensor, steps: int
+    features: Float[Tensor, "n d"], given: Float[Tensor, "n k"], edges: Tensor, steps: int
 ) -> Float[Tensor, "n k"]:
     """Predictions of a graph net that has learned the teacher's."""
-    net = GraphNet(features.shape[1], said.shape[1])
+    net = GraphNet(features.shape[1], given.shape[1])
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, weight_decay=5e-4)
-    labels = said.argmax(dim=1)
+    labels = given.argmax(dim=1)
     with torch.enable_grad():
         for _ in range(steps):
-            shown = said * (torch.rand(len(said), 1) >= 0.2)
+            shown = given * (torch.rand(len(given), 1) >= 0.2)
             loss = F.cross_entropy(net(features, shown, edges), labels)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
     with torch.no_grad():
-        return net.eval()(features, said, edges).softmax(dim=1)
+        return net.eval()(features, given, edges).softmax(dim=1)

@@ -117,10 +117,10 @@ class LabelFreeSearch(OverLauncher):
                 batch.append(self._ask(study, space))
             if not batch:
                 return done
-            jobs = [[*fixed, *_overrides(words(asked.params))] for asked in batch]
+            jobs = [[*fixed, *_overrides(words(one.params))] for one in batch]
             results = self.launch(jobs, batch[0].number)
-            for asked, result in zip(batch, results, strict=True):
-                _tell(study, asked, result)
+            for one, result in zip(batch, results, strict=True):
+                _tell(study, one, result)
             done += results
             failed = all(result.status != JobStatus.COMPLETED for result in results)
             if failed and not study.get_trials(states=(TrialState.COMPLETE,)):

@@ -136,8 +136,8 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     def prior_of(weights: Path) -> Prior | None:
         # A given teacher learnt elsewhere, but the warm-up's last net from the labelled clouds.
         warmups = {files["selected"]: loaded.learnt, files["last"]: loaded.labelled}
-        met, said = warmups.get(weights, learnt), partial(nets.of, "target", weights)
-        return prior_beside(cfg.evaluation, evaluation.classes, met, said)
+        shares, probabilities = warmups.get(weights, learnt), partial(nets.of, "target", weights)
+        return prior_beside(cfg.evaluation, evaluation.classes, shares, probabilities)
 
     def reported(weights: Path) -> Float[np.ndarray, "n c"]:
         found, prior = nets.of("test", weights), prior_of(weights)
@@ -147,7 +147,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     predictions = evaluation.predictions_of(reported(file))
     if built.trainer.is_global_zero:
         _write(run, loaded, nets, file, learnt, predictions)
-    prior, called, student, training = prior_of(file), component_names(cfg), None, None
+    prior, parts, student, training = prior_of(file), component_names(cfg), None, None
     if cfg.data.clouds_a_class is not None:
         hits = nets.of("labelled", file).argmax(axis=1) == data.labelled.labels.numpy()
         log.info("%.1f %% of the %d training clouds are right", 100 * hits.mean(), len(hits))
@@ -163,9 +163,9 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         source=data.labelled_domain.domain.name,
         target=run.target.name,
         simulated=bool(run.target.simulated),
-        method=called["method"],
-        selftraining=called["selftraining"],
-        model=called["model"],
+        method=parts["method"],
+        selftraining=parts["selftraining"],
+        model=parts["model"],
         selection=_selection(run, loaded, built.warmup, choice),
         loading=Loading(
             points=cfg.data.points,

@@ -155,11 +155,11 @@ def prior_beside(
     settings: Any,
     classes: Sequence[str],
     learnt: Shares,
-    said: Callable[[], Float[np.ndarray, "n c"]],
+    probabilities: Callable[[], Float[np.ndarray, "n c"]],
 ) -> Prior | None:
     """`evaluation.prior` beside these shares; None if there is none.
 
-    `said`: the net's probabilities of the target's training clouds, for shares that are estimated.
+    `probabilities`: the net's, of the target's training clouds, for shares that are estimated.
 
     Raises:
         ConfigError: it is no prior.
@@ -168,7 +168,7 @@ def prior_beside(
         return None
     given: Any = settings.prior
     if given == ESTIMATED:
-        given = dict(zip(classes, estimate_shares(said(), learnt).tolist(), strict=True))
+        given = dict(zip(classes, estimate_shares(probabilities(), learnt).tolist(), strict=True))
     given = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
     return read_prior(given, classes, learnt, settings.prior_power)
 

@@ -75,12 +75,12 @@ class BlenderRenderer:
     ) -> list[Image]:
         """Render every camera; see `Renderer.render`."""
         with tempfile.TemporaryDirectory(prefix="qs3-blender-") as folder:
-            said = Path(folder) / "blender.log"
+            path = Path(folder) / "blender.log"
             try:
-                with _quiet(said):
+                with _quiet(path):
                     return self._render(scene, cameras, seed, geometry, Path(folder))
             except (RuntimeError, OSError) as error:
-                tail = said.read_text(errors="replace")[-500:].strip() if said.exists() else ""
+                tail = path.read_text(errors="replace")[-500:].strip() if path.exists() else ""
                 raise RenderError(f"Blender failed: {error} {tail}".strip()) from error
 
     def provenance(self) -> dict[str, str]:
@@ -235,12 +235,12 @@ def _one_cpu() -> Iterator[None]:
 
 
 @contextmanager
-def _quiet(said: Path) -> Iterator[None]:
+def _quiet(path: Path) -> Iterator[None]:
     """Send what C code prints to a file; Blender reports every image on stdout."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [os.dup(1), os.dup(2)]
-    sink = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    sink = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     try:
         os.dup2(sink, 1)
         os.dup2(sink, 2)

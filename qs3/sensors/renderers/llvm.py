@@ -117,9 +117,9 @@ def try_variant(variant: str, llvm_path: str | None) -> str | None:
         return f"no answer within {_CHILD_TIMEOUT_S:.0f} s"
     if child.returncode == 0 and _CHILD_OK in child.stdout:
         return None
-    said = [line.strip() for line in child.stderr.splitlines() if line.strip()]
-    last = said[-1] if said else "no message"
-    reason = next((line for line in said if "LLVM ERROR" in line), last)
+    printed = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    last = printed[-1] if printed else "no message"
+    reason = next((line for line in printed if "LLVM ERROR" in line), last)
     how = f"killed by signal {-child.returncode}" if child.returncode < 0 else "failed"
     return f"{how}: {reason[:300]}"
 
