@@ -103,13 +103,14 @@ def _plane_of_three(
 ) -> np.ndarray:
     """The plane through three random pixels that most others are near, of many tries."""
     few = rng.choice(len(inverse), min(len(inverse), 4000), replace=False)
+    design_of_few, inverse_of_few = design[few], inverse[few]
     best, normal = np.inf, np.array([float(np.median(inverse)), 0.0, 0.0])
     for _ in range(300):
         triple = rng.choice(few, 3, replace=False)
         if abs(np.linalg.det(design[triple])) < 1e-6:
             continue
         trial = np.linalg.solve(design[triple], inverse[triple])
-        quantile = float(np.quantile(np.abs(design[few] @ trial - inverse[few]), 0.3))
+        quantile = float(np.quantile(np.abs(design_of_few @ trial - inverse_of_few), 0.3))
         if quantile < best:
             best, normal = quantile, trial
     return normal

@@ -43,7 +43,7 @@ class Catalogue:
         ]
 
     def _item(self, cls: str, split: str, index: int) -> MeshItem:
-        names = [f.name for f in families(cls) if f.split == split]
+        names = tuple(f.name for f in families(cls) if f.split == split)
         family = _shuffled(names, f"{self.seed}/{cls}/{split}")[index % len(names)]
         return MeshItem(
             id=f"{cls}/{split}/{cls}_{index:04d}",
@@ -74,7 +74,8 @@ def make_parts(cls: str, family: str, key: str) -> list[Mesh]:
     return [Mesh(part.vertices - shift, part.faces) for part in parts]
 
 
-def _shuffled(names: list[str], key: str) -> list[str]:
+@cache
+def _shuffled(names: tuple[str, ...], key: str) -> list[str]:
     """The names in an order that depends on `key`; going round it uses all equally often."""
     draw = Draw(f"order of families/{key}")
     return [name for _, name in sorted((draw.between(0, 1), name) for name in names)]

@@ -268,12 +268,12 @@ def leaf(
     steps = np.gradient(path, axis=0)
     tangents = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     side = _perpendicular(np.asarray(across, dtype=np.float64), tangents[len(path) // 2])
-    rings = []
-    for t, point, tangent in zip(np.linspace(0, 1, len(path)), path, tangents, strict=True):
+    rings, normals = [], np.cross(side, tangents)
+    for t, point, normal in zip(np.linspace(0, 1, len(path)), path, normals, strict=True):
         rise = np.sin(0.5 * np.pi * t / belly)
         fall = np.cos(0.5 * np.pi * (t - belly) / (1 - belly))
         share = max(float(rise if t < belly else fall), 0.06)
-        half, lift = 0.5 * width * share, 0.5 * thickness * share**0.5 * np.cross(side, tangent)
+        half, lift = 0.5 * width * share, 0.5 * thickness * share**0.5 * normal
         rings.append([point - half * side, point - lift, point + half * side, point + lift])
     return loft(np.array(rings))
 

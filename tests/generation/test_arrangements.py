@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.generation.arrangements import Arrangement
@@ -35,7 +35,7 @@ def rng(seed):
 def test_a_chair_s_front_is_under_the_table_or_before_it_and_its_back_is_not(back):
     mesh, covered = chair(back), []
     axis, sign = (1, -1) if back == "+y" else (0, 1)  # towards the table
-    for seed in range(60):
+    for seed in range(40):
         (table,) = ALWAYS.around(mesh, "chair", rng(seed))
         low, high = table.bounds
         assert low[2] == 0
@@ -49,11 +49,12 @@ def test_a_chair_s_front_is_under_the_table_or_before_it_and_its_back_is_not(bac
         # 0.25; the back is found by samples, so a table is turned by a degree or two.
         assert -0.21 - 0.02 <= edge.min() <= 0.25 + 0.3
         covered.append(edge.min() < 0.25)
-    assert 15 < sum(covered) < 60
+    assert 15 < sum(covered) < 40
     assert not Arrangement().around(mesh, "chair", rng(0))
     assert not ALWAYS.around(mesh, "sofa", rng(0))
 
 
+@settings(max_examples=40)
 @given(seed=st.integers(0, 1000))
 def test_things_stand_on_flat_places(seed):
     """A top of 1.2 x 0.8 m, 70 cm high, with a wall of 20 cm along one side."""
@@ -72,7 +73,7 @@ def test_things_stand_on_flat_places(seed):
 
 
 def test_how_many_things_is_uniform_and_a_slope_has_none():
-    top = box((2.0, 2.0, 0.5), (0, 0, 0.25))
+    top = box((1.0, 1.0, 0.5), (0, 0, 0.25))
     law = Arrangement(things={"table": 3}, max_thing_m=0.1)
     numbers = [len(law.around(top, "table", rng(seed))) for seed in range(200)]
     assert {*numbers} == {0, 1, 2, 3}

@@ -119,11 +119,10 @@ def test_a_worktop_is_not_its_cabinet_s(made):
     recipe = replace(made.recipe, worktops={"chair": 1.0}, torn=0.0)
     solid = trimesh.creation.box((0.8, 0.5, 0.8))
     mesh = Mesh(np.asarray(solid.vertices), np.asarray(solid.faces))
-    for seed in range(2):
-        highest = recipe.make(mesh, ID, seed, made.renderer).arrays["points_clean"][:, 2].max()
-        assert 0.5 < highest < 0.78  # 5 cm and less by the sensor's noise
-        whole = replace(recipe, worktops={}).make(mesh, ID, seed, made.renderer)
-        assert whole.arrays["points_clean"][:, 2].max() == pytest.approx(0.8, abs=1e-3)
+    highest = recipe.make(mesh, ID, 0, made.renderer).arrays["points_clean"][:, 2].max()
+    assert 0.5 < highest < 0.78  # 5 cm and less by the sensor's noise
+    whole = replace(recipe, worktops={}).make(mesh, ID, 0, made.renderer)
+    assert whole.arrays["points_clean"][:, 2].max() == pytest.approx(0.8, abs=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +145,7 @@ def test_a_raised_object_stands_on_furniture_that_stands_on_the_floor(made, lamp
     scene = Room(wall=0, max_clutter=5, max_occluders=2, support=furniture)
     eyes = np.array([[2.2, 0.3, 1.5], [2.2, 0.3, 0.25]])  # from above, and below the top
     below = 0
-    for seed in range(4):
+    for seed in range(2):
         bodies = scene.bodies(lamp.placed, eyes, _rng(seed), floor_m=0.0)
         assert [body.label for body in bodies] == [1] + [0] * (len(bodies) - 1)
         floor, under, *pieces = (body.mesh for body in bodies[1:])
