@@ -37,8 +37,9 @@ def test_experiment_runs(experiment, published, tmp_path):
     lines = (ROOT / "conf" / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[1].startswith(f"# python train.py experiment={experiment} ")
     overrides = [
-        f"experiment={experiment}", "debug=fast", "data.points=64", "logger=csv", "seed=0",
-        "trainer.threads=1", f"paths.data_dir={published.folder}", f"paths.log_dir={tmp_path}",
+        f"experiment={experiment}", "debug=fast", "data.points=64", "protocol.batch_size=8",
+        "logger=csv", "seed=0", "trainer.threads=1",
+        f"paths.data_dir={published.folder}", f"paths.log_dir={tmp_path}",
     ]  # fmt: skip
     if experiment == "own_meshes":
         overrides += ["data.target.floor_m=0"]

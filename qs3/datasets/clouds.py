@@ -294,8 +294,9 @@ def _text(path: Path) -> CloudFile:
     text = path.read_bytes().decode("utf-8-sig", "replace").replace("//", "#")
     for line in text.splitlines():
         row, _, comment = (part.strip(_ENDS) for part in line.partition("#"))
-        words = [word.strip('"').lower() for word in re.findall(r"[^,;\s]+", row or comment)]
-        if not rows and all(words.count(axis) == 1 for axis in _XYZ):
+        found = [] if rows else re.findall(r"[^,;\s]+", row or comment)
+        words = [word.strip('"').lower() for word in found]
+        if all(words.count(axis) == 1 for axis in _XYZ):
             names = words
         elif row:
             rows.append(row)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -71,7 +71,7 @@ class ScannedObject:
         parts = [view.frame.points(view.frame.depth_m, view.believed) for view in self.views]
         return np.concatenate([*parts, np.zeros((0, 3))])
 
-    @property
+    @cached_property
     def residual_m(self) -> Float[np.ndarray, " p"]:
         """Distance of each point of `cloud` to the mesh, by a million samples of its surface.
 
@@ -80,7 +80,8 @@ class ScannedObject:
         """
         rng = np.random.default_rng(0)
         surface = surface_sample(self.mesh.vertices, self.mesh.faces, _SURFACE, rng)
-        found, nearest = cKDTree(surface).query(self.cloud)
+        tree = cKDTree(surface, balanced_tree=False, compact_nodes=False)  # built in half the time
+        found, nearest = tree.query(self.cloud)
         if not self.views:
             return np.asarray(found)
         counts = [int(np.isfinite(view.frame.depth_m).sum()) for view in self.views]

@@ -191,14 +191,11 @@ def _filled(
     """The cell with its runs: those of its config, and kept ones of the seeds that these lack."""
     lines = NO_RUNS
     if kept is None or found:
-        # Without the place of runs, which is not hashed: all folders share what is cached.
-        words = tuple(word for word in cell.overrides if not word.startswith("paths.log_dir="))
-        place = f"table cell {cell.row!r}, {cell.column!r}: "
-        key, cfg = _composed(words, place)
+        key, cfg = composed_of(cell)
         if target and str(cfg.method.get("_target_")).endswith(".Supervised"):
             more = f"domain@data.source={target}"  # the upper bound has labels of its target
             cell = replace(cell, overrides=(*cell.overrides, more))
-            key, cfg = _composed((*words, more), place)
+            key, cfg = composed_of(cell)
         domain = cfg.data.target
         cell = replace(cell, target=str(domain.name), simulated=bool(domain.simulated))
         lines = found.get((*key, cell.entry.take), NO_RUNS)
@@ -211,9 +208,15 @@ def _filled(
     return replace(cell, runs=Runs(lines))
 
 
+def composed_of(cell: Cell) -> tuple[tuple[str, str], DictConfig]:
+    """Experiment and hash of a cell's command, and its config."""
+    # Without the place of runs, which is not hashed: all folders share what is cached.
+    words = tuple(word for word in cell.overrides if not word.startswith("paths.log_dir="))
+    return _composed(words, f"table cell {cell.row!r}, {cell.column!r}: ")
+
+
 @functools.lru_cache(maxsize=4096)
 def _composed(words: tuple[str, ...], place: str) -> tuple[tuple[str, str], DictConfig]:
-    """Experiment and hash of a command line of train.py, and its config."""
     from qs3.config.hashing import config_hash
 
     cfg = composed("train", *words, place=place)

@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobRuntime
 from hydra.version import VersionBase, getbase, setbase
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
@@ -50,6 +50,7 @@ def understood(word: str):
     return cfg.folder
 
 
+@settings(max_examples=50)
 @given(st.text(st.sampled_from("ab1.,:=~/\\'\"()[]{}$ \té日\n-+e") | st.characters(codec="utf-8")))
 @example("${oc.env:HOME}")
 @example("\\\\${a}")

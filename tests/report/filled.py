@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from qs3.config.hashing import config_hash
-from qs3.report.table import build_table
+from qs3.report.table import build_table, composed_of
 from qs3.runs.predictions import FILE, Predictions, write_predictions
-from tests.composing import compose
 from tests.report.made_runs import write_run
 
 PLACE = "target test"
@@ -15,12 +13,12 @@ PLACE = "target test"
 
 def run_cell(log_dir, cell, seeds=(0, 1, 2), **changes):
     """Leave results for a cell, as if its command had been run; returns the runs' folders."""
-    cfg = compose("train", list(cell.overrides))
+    (experiment, hash_), _ = composed_of(cell)
     return [
         write_run(
             log_dir,
-            experiment=cfg.experiment_name,
-            hash=config_hash(cfg),
+            experiment=experiment,
+            hash=hash_,
             seed=seed,
             **{"accuracy": 0.5 + seed / 100, **changes},
         )

@@ -20,7 +20,6 @@ rows:
   - {{name: DANN, run: experiment=cad10 method=dann}}
   - {{name: PCM, run: experiment=cad10}}
   - {{name: GAST, run: experiment=cad10 method=gast}}
-  - {{name: GAST + SPST, run: experiment=cad10 method=gast selftraining=spst}}
 """
 BLOCKS = {
     "meshes": tuple(f"block{i // 5:04d}" for i in range(20)),

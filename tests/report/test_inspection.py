@@ -170,15 +170,15 @@ def test_what_is_drawn_is_not_at_even_steps():
 
 def test_commands(tmp_path, capsys):
     for name in ("modelnet10", "kinectsim10"):
-        fixtures.write_domain(name, tmp_path, {"train": 2, "test": 1})
+        fixtures.write_domain(name, tmp_path, {"train": 1, "test": 1})
     words = ["inspect", "modelnet10", f"data_dir={tmp_path}", f"out={tmp_path / 'i'}"]
     assert main(words) == 0
     said = capsys.readouterr().out
-    assert "30 clouds of 2048 points" in said
+    assert "20 clouds of 2048 points" in said
     assert "made of: published files" in said
-    assert len((tmp_path / "i" / "inspection.csv").read_text().splitlines()) == 31
+    assert len((tmp_path / "i" / "inspection.csv").read_text().splitlines()) == 21
     assert not_blank(tmp_path / "i" / "clouds.png")
-    assert "30 of 30 clouds of" in (tmp_path / "i" / "clouds.html").read_text()
+    assert "20 of 20 clouds of" in (tmp_path / "i" / "clouds.html").read_text()
     words = ["compare", "modelnet10", f"{tmp_path}/kinectsim10", f"out={tmp_path / 'c'}"]
     assert main([*words, f"a.paths.data_dir={tmp_path}", "b.variant=points_clean"]) == 0
     facts = json.loads((tmp_path / "c" / "comparison.json").read_text())

@@ -22,10 +22,11 @@ def add_net(folder, seed, *, classes=CLASSES, **changes):
     """A run's result.pt of an untrained net; its last bias makes it name several classes."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        net = pointnet(num_classes=len(classes))
+        net = pointnet(num_classes=len(classes), variant="basic")
+    model = {"_target_": "qs3.models.pointnet.pointnet", "variant": "basic"}
     values = {
-        "model": {"_target_": "qs3.models.pointnet.pointnet", "num_classes": len(classes)},
-        "classes": tuple(classes), "points": 64, "stored_points": 128, "target": "kinectsim10",
+        "model": {**model, "num_classes": len(classes)},
+        "classes": tuple(classes), "points": 32, "stored_points": 128, "target": "kinectsim10",
         "gravity": "z", "scale": "unit_ball", "usual": {}, "weights": net.state_dict(),
     }  # fmt: skip
     write_result(folder / "result.pt", Result(**{**values, **changes}))

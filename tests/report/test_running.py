@@ -55,7 +55,11 @@ def test_a_table_is_trained_kept_and_printed(tmp_path, capfd):
     A job that fails is the exit status, and stops no other.
     """
     write_toy(tmp_path / "data")
-    toy = [w for w in overrides(tmp_path)[1:] if not w.startswith(("paths.", "selftraining."))]
+    toy = [
+        w
+        for w in overrides(tmp_path, "protocol.epochs=1")[1:]
+        if not w.startswith(("paths.", "selftraining."))
+    ]
     run = "run: experiment=quickstart method=source_only selftraining=none"
     own = (
         "title: Own\nmetrics: [accuracy]\ncolumns: [T]\nrows:\n"
@@ -65,17 +69,17 @@ def test_a_table_is_trained_kept_and_printed(tmp_path, capfd):
     (tmp_path / "own.yaml").write_text(own + failing)
     words = [f"table={tmp_path / 'own.yaml'}", f"log_dir={tmp_path / 'logs'}"]
     words += [f"data_dir={tmp_path / 'data'}", f"overrides={shlex.join(toy)}"]
-    assert main(["report", "train", *words, "seeds=0,1"]) == 1
+    assert main(["report", "train", *words, "seeds=0"]) == 1
     said = capfd.readouterr().out
-    assert "4 runs to do" in said
-    assert "2 of 4 jobs failed" in said
+    assert "2 runs to do" in said
+    assert "1 of 2 jobs failed" in said
     (tmp_path / "own.yaml").write_text(own)
     kept = tmp_path / "own.csv.gz"
     assert main(["report", "keep", *words, f"into={kept}"]) == 0
     first = kept.read_bytes()
     assert main(["report", "keep", *words, f"into={kept}", f"kept={kept}"]) == 0
     assert kept.read_bytes() == first
-    assert main(["report", "train", *words, "seeds=0,1"]) == 0
+    assert main(["report", "train", *words, "seeds=0"]) == 0
     assert "0 runs to do" in capfd.readouterr().out
     pages = []
     for more in (words, [words[0], f"kept={kept}", f"log_dir={tmp_path / 'none'}"]):

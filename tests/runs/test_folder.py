@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
@@ -13,8 +12,7 @@ from qs3.config import hashing
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs import folder as runs
 from qs3.utils.files import owned
-
-CONF = Path(__file__).parents[2] / "conf"
+from tests.composing import compose
 
 BASE = {
     "experiment_name": "x",
@@ -124,20 +122,14 @@ def test_clear_keeps_what_hydra_wrote(tmp_path):
 
 def test_which_commands_are_the_same_run():
     """The card that trains a run does not name it, and no search of its settings; ddp does."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        whole, dann, searched, ddp, *gpus = (
-            hashing.run_name(compose("train", ["experiment=qs3_s2d", *words]))
-            for words in (
-                *(
-                    [],
-                    ["method=dann"],
-                    ["hparams_search=qbst_optuna"],
-                    ["trainer=gpu", "trainer.devices=2"],
-                ),
-                *(["trainer=gpu"], ["trainer=gpus_in_turn"]),
-                ["trainer=gpu", "trainer.devices=[3]"],
-            )
+    whole, dann, searched, ddp, *gpus = (
+        hashing.run_name(compose("train", ["experiment=qs3_s2d", *words]))
+        for words in (
+            *([], ["method=dann"], ["hparams_search=qbst_optuna"]),
+            *(["trainer=gpu", "trainer.devices=2"], ["trainer=gpu"], ["trainer=gpus_in_turn"]),
+            ["trainer=gpu", "trainer.devices=[3]"],
         )
+    )
     assert re.fullmatch(r"qs3_s2d/seed0-[0-9a-f]{8}", whole)
     assert searched == whole
     assert len({*gpus}) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import re
@@ -14,6 +15,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
+from omegaconf import OmegaConf
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
@@ -194,13 +196,12 @@ def test_the_search_is_within_what_self_training_takes():
     with initialize_config_dir(str(CONF), version_base="1.3"):
         words = ["experiment=qs3_s2d", SEARCH]
         cfg = compose("train", words, return_hydra_config=True)
-        params = dict(cfg.hydra.sweeper.params)
-        for end in (0, -1):
-            chosen = []
-            for key, text in params.items():
-                values = re.findall(r"[\d.]+", text)
-                chosen.append(f"{key}={values[:2][end] if '(' in text else values[end]}")
-            build(compose("train", [*words, *chosen]).selftraining)  # raises if it is not
+    params = dict(cfg.hydra.sweeper.params)
+    for end in (0, -1):
+        for key, text in params.items():
+            values = re.findall(r"[\d.]+", text)
+            OmegaConf.update(cfg, key, json.loads(values[:2][end] if "(" in text else values[end]))
+        build(cfg.selftraining)  # raises if it is not
 
 
 @pytest.mark.slow
