@@ -37,7 +37,7 @@ def test_maxima_and_who_has_them_first(points, rows, k, channels, dtype, seed):
                 assert where[i, c] == index[i, first]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.data(), width=st.sampled_from([32, 64]), rows=st.integers(0, 3))
 def test_the_kth_smallest_is_that_of_sorted_rows(data, width, rows):
     kind = np.dtype(f"float{width}").type

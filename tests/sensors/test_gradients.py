@@ -50,7 +50,7 @@ def twin(renderer):
 )
 def test_its_images_and_disparities_are_those_of_the_ordinary_sensor(name, renderer):
     bodies = SCENES[name]
-    twin = replace(twin_of(SENSOR, bodies, box_of(*bodies), POSE, renderer), fine=8)
+    twin = replace(twin_of(SENSOR, bodies, box_of(*bodies), POSE, renderer), fine=4)
     settings = settings_of(SENSOR, GAIN)
     frame = SENSOR.scan(bodies, box_of(*bodies), POSE, renderer, np.random.default_rng(0))
     # Where the pixel and those that the lens and a block mix into it are of one surface.

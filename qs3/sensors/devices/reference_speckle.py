@@ -73,10 +73,10 @@ class ReferenceSpeckle(TriangulatingSensor):
         y = (v - k.cy_px) / k.focal_px
         col = np.floor(x * slide_px + cols / 2).astype(int)
         row = np.floor(y * slide_px + rows / 2).astype(int)
-        seen = np.zeros((len(row), len(col)), dtype=np.float32)
-        in_col, in_row = (col >= 0) & (col < cols), (row >= 0) & (row < rows)
-        seen[np.ix_(in_row, in_col)] = slide[np.ix_(row[in_row], col[in_col])]
-        image = seen.reshape(self.height_px, fine, self.width_px, fine).mean(axis=(1, 3))
+        dark = np.pad(slide, (0, 1))  # the last row and column are what lies beside the slide
+        lit = dark[row.clip(-1, rows)].reshape(self.height_px, fine, -1).sum(axis=1)
+        image = lit[:, col.clip(-1, cols)].reshape(self.height_px, self.width_px, fine).sum(axis=2)
+        image /= fine**2
         if self.infrared.psf_px:  # it was stored through the same lens
             image = cv2.GaussianBlur(image, (0, 0), self.infrared.psf_px)
         return np.ascontiguousarray(image * 255, dtype=np.float32)

@@ -34,7 +34,7 @@ def test_noise_and_bias_follow_the_stated_law(renderer, white_level):
     camera = replace(SIDE, infrared=replace(SIDE.infrared, white_level=white_level))
     measured = []
     for depth in (0.8, 1.5, 2.5):
-        frame = scan(camera, [square(depth, 0.2 * depth)], renderer, seed=int(10 * depth))
+        frame = scan(camera, [square(depth, 0.1 * depth)], renderer, seed=int(10 * depth))
         law, error = law_of(camera, frame, depth), middle(frame.depth_m) - depth
         assert np.isfinite(error).all()
         assert (error / law).std() == pytest.approx(1, abs=0.05)

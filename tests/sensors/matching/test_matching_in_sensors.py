@@ -56,6 +56,6 @@ def test_planes_of_a_stereo_sensor_come_back(renderer, name):
 )
 def test_planes_of_a_sensor_with_a_stored_pattern_come_back(renderer, name):
     sensor = ReferenceSpeckle(matcher=KINECT[name])
-    pooled = np.concatenate(list(depth_errors(sensor, renderer, np.linspace(1.95, 2.05, 8), 0.2)))
+    pooled = np.concatenate(list(depth_errors(sensor, renderer, np.linspace(1.95, 2.05, 8), 0.1)))
     assert abs(np.median(pooled)) < 0.04
     assert np.quantile(np.abs(pooled), 0.68) < 0.15
