@@ -8,7 +8,6 @@ known class, and get a confident answer.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -37,7 +36,6 @@ OTHER_UNITS = "as of other units than metres"
 _NO_METRES = 10.0  # times the largest size: centimetres, millimetres or inches
 _MOST = 1000  # clouds that are measured of a domain; 3 ms each
 _LOOKED_AT = 300  # of a domain, for a share
-_known: WeakKeyDictionary[Clouds, dict[int, dict[str, float]]] = WeakKeyDictionary()  # by cloud
 
 
 def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
@@ -144,6 +142,6 @@ def ood_share(clouds: Clouds, source: Clouds) -> float:
 def _measured(clouds: Clouds, most: int) -> list[dict[str, float]]:
     """The measures of at most `most` clouds, evenly spaced; each cloud is measured once."""
     chosen = np.unique(np.linspace(0, len(clouds) - 1, min(len(clouds), most)).astype(int))
-    known = _known.setdefault(clouds, {})
+    known = vars(clouds).setdefault("_measured", {})  # with them, as a cached property is
     known |= {i: measure_one(clouds, i) for i in chosen.tolist() if i not in known}
     return [known[i] for i in chosen.tolist()]

@@ -25,6 +25,10 @@ from qs3.training import evaluate as stage
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES, TinyNet, write_domain
 
+PACKAGES = ("qs3.models", "tests")
+
+WORDS = ("method=source_only", "selftraining=none", "protocol.epochs=1")
+
 
 @pytest.fixture
 def passes(monkeypatch):
@@ -45,7 +49,7 @@ def passes(monkeypatch):
 @pytest.mark.parametrize(
     ("more", "nets"),
     [
-        ((), 3),
+        (("selftraining.rounds=1",), 3),
         (("selftraining=none", "evaluation.norms=adabn"), 3),
         (("selftraining=none", "protocol.epochs=1"), 1),
     ],
@@ -61,8 +65,7 @@ def test_equal_weights_predict_equal_clouds_once(toy, passes, more, nets):
 
 
 def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
-    changes = ("method=source_only", "selftraining=none")
-    plain, adapted = toy(*changes), toy(*changes, "evaluation.norms=adabn")
+    plain, adapted = toy(*WORDS), toy(*WORDS, "evaluation.norms=adabn")
     plain_metrics, metrics = train(plain), train(adapted)
     assert plain_metrics.evaluation.norms == "trained"
     assert metrics.evaluation.norms == "adabn"
@@ -82,7 +85,7 @@ def test_the_net_is_asked_as_it_was_trained(toy, tmp_path):
     """The target's statistics make a net surer than it is right."""
     write_domain(tmp_path / "data", "specklenet10", noise=0.1)
     write_domain(tmp_path / "data", "kinectsim10", noise=0.6, test=12)
-    changes = ("method=source_only", "selftraining=none", f"paths.data_dir={tmp_path / 'data'}")
+    changes = (*WORDS, f"paths.data_dir={tmp_path / 'data'}")
     plain = train(toy(*changes)).quality
     adapted = train(toy(*changes, "evaluation.norms=adabn")).quality
     assert plain.expected is not None
@@ -106,11 +109,6 @@ def test_order_of_clouds_is_mixed_and_batches_are_even():
     seen.clear()
     adapt_norms(Net(3), points[:7], 2, seed=0)  # 3.5 batches, which rounds to 4
     assert [len(batch) for batch in seen] == [3, 2, 2]
-
-
-PACKAGES = ("qs3.models", "tests")
-
-WORDS = ("method=source_only", "selftraining=none", "protocol.epochs=2")
 
 
 def test_the_reported_probabilities_are_weighed_and_estimates_are_not(toy) -> None:
@@ -169,7 +167,7 @@ def test_classes_count_as_the_net_met_them_and_load_does_the_same(toy, uneven: P
 
 def test_a_student_has_met_its_pseudo_labels(toy, uneven: Path) -> None:
     """From scratch and without the source; beside it, the mean of both."""
-    rounds = ("method=source_only", "protocol.epochs=2")
+    rounds = ("method=source_only", "protocol.epochs=2", "selftraining.rounds=1")
     factors, run = factors_of(toy, uneven, *rounds)
     selected = read_metrics(run).rounds[-1].selected
     counts = np.array([selected[name] for name in CLASSES]) + 1.0

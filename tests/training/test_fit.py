@@ -75,13 +75,14 @@ def test_seed_1_alone_equals_seed_1_after_seed_0(toy, toy_data, tmp_path):
 
 
 def test_finished_run_is_skipped_and_force_repeats_it(toy, monkeypatch):
-    cfg = toy("selftraining=none", "method=source_only")
+    words = ("selftraining=none", "method=source_only", "protocol.epochs=1")
+    cfg = toy(*words)
     first = train(cfg)
     folder = hashing.run_folder(cfg)
     stamp = (folder / "last.ckpt").stat().st_mtime_ns
     assert train(cfg) == first
     assert (folder / "last.ckpt").stat().st_mtime_ns == stamp
-    again = train(toy("selftraining=none", "method=source_only", "force=true"))
+    again = train(toy(*words, "force=true"))
     assert (folder / "last.ckpt").stat().st_mtime_ns != stamp
     assert replace(again, times=first.times) == first
 
@@ -149,12 +150,13 @@ def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
         return table
 
     monkeypatch.setattr("qs3.selftraining.callback.predict", only_two)
+    words = ("protocol.epochs=1", "selftraining.rounds=1")
     with caplog.at_level(logging.WARNING):
-        metrics = train(toy())
+        metrics = train(toy(*words))
     assert "no pseudo-label for slab" in caplog.text
     assert metrics.rounds[0].missing_classes == ["slab"]
     with pytest.raises(SelectionError, match="slab"):
-        train(toy("selftraining.missing_class=error"))
+        train(toy(*words, "selftraining.missing_class=error"))
 
 
 def test_two_runs_in_one_folder(toy):
@@ -166,26 +168,25 @@ def test_two_runs_in_one_folder(toy):
         train(cfg)
 
 
-@pytest.mark.parametrize(
-    ("place", "error"), [(("config_sha256",), ConfigError), (("data", "target"), DataError)]
-)
-def test_other_settings_of_the_same_name_and_changed_data_are_refused(toy, place, error):
+def test_other_settings_of_the_same_name_and_changed_data_are_refused(toy):
     cfg = toy("selftraining=none", "protocol.epochs=1")
     metrics = train(cfg)
     folder = hashing.run_folder(cfg)
     assert metrics.config_sha256 == hashing.config_sha256(cfg)
-    for name in ("metrics.json", "started.json"):
-        value = json.loads((folder / name).read_text())
-        inner = value
-        for key in place[:-1]:
-            inner = inner[key]
-        inner[place[-1]] = inner[place[-1]][:8] + "0" * 56
-        (folder / name).write_text(json.dumps(value))
-    with pytest.raises(error):
-        train(cfg)
-    (folder / "metrics.json").unlink()
-    with pytest.raises(error):
-        train(cfg)
+    files = {name: (folder / name).read_text() for name in ("metrics.json", "started.json")}
+    for place, error in (("config_sha256",), ConfigError), (("data", "target"), DataError):
+        for name, text in files.items():
+            value = json.loads(text)
+            inner = value
+            for key in place[:-1]:
+                inner = inner[key]
+            inner[place[-1]] = inner[place[-1]][:8] + "0" * 56
+            (folder / name).write_text(json.dumps(value))
+        with pytest.raises(error):
+            train(cfg)
+        (folder / "metrics.json").unlink()
+        with pytest.raises(error):
+            train(cfg)
 
 
 def without(data: Path) -> None:
@@ -212,8 +213,8 @@ def test_an_old_result_stays_where_its_data_cannot_be_opened(toy, toy_data, tmp_
 
 
 def test_a_run_of_few_clouds_leaves_no_cache(toy, tmp_path):
-    cfg = toy("data.clouds_a_split=12", "selftraining=none", f"data.cache_dir={tmp_path / 'cache'}")
-    metrics = train(cfg)
+    words = ("data.clouds_a_split=12", "selftraining=none", "protocol.epochs=1")
+    metrics = train(toy(*words, f"data.cache_dir={tmp_path / 'cache'}"))
     assert metrics.final.n == 12
     assert not list((tmp_path / "cache").rglob("*.npy"))
 
@@ -253,7 +254,7 @@ def test_a_checkpoint_with_a_flipped_bit_is_refused(toy):
 
 @pytest.mark.parametrize("changed", [{}, {"torch": "1.0"}, {"files": {"qs3's code": "0" * 64}}])
 def test_a_warm_up_of_two_versions_is_given_to_nobody(toy, changed, tmp_path, caplog):
-    cfg = toy(f"paths.warmup_dir={tmp_path / 'warmups'}")
+    cfg = toy("selftraining=none", f"paths.warmup_dir={tmp_path / 'warmups'}")
     interrupt(cfg, epoch=1)
     change_started(hashing.run_folder(cfg), **changed)
     train(cfg)

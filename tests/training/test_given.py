@@ -35,7 +35,7 @@ def test_another_classifier_under_its_name_is_refused(toy, finished, tmp_path):
     teacher = tmp_path / "teacher.pt"
     result = read_result(finished)
     write_result(teacher, result)
-    cfg = toy(*ONLY_ROUNDS, f"weights={teacher}")
+    cfg = toy(*ONLY_ROUNDS, "selftraining.rounds=1", f"weights={teacher}")
     before = train(cfg)
     assert train(cfg).final == before.final  # it is there, and the same
     changed = {name: value + 1 for name, value in result.weights.items()}

@@ -250,6 +250,7 @@ def test_a_flipped_bit_is_no_warm_up(tmp_path, caplog):
 
 def test_what_cannot_be_written_is_a_warning(toy, tmp_path, caplog):
     (tmp_path / "file").write_text("")
-    metrics = train(toy("selftraining=none", f"paths.warmup_dir={tmp_path / 'file'}"))
+    words = ("selftraining=none", "protocol.epochs=2", f"paths.warmup_dir={tmp_path / 'file'}")
+    metrics = train(toy(*words))
     assert metrics.status == "finished"
     assert "the warm-up cannot be shared" in caplog.text
