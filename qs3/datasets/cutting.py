@@ -16,12 +16,9 @@ from typing import Annotated, Any, NamedTuple
 
 import cv2
 import numpy as np
+import scipy  # imports its parts when they are used, some of them slowly
 from annotated_types import Ge, Gt
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from qs3.datasets.depth_images import DepthImage
 from qs3.utils.settings import Count, NotNegative, settings
@@ -286,8 +283,8 @@ def pieces(
         index = pixels[row, column]
         edges.append(np.stack([index[1:][near], index[:-1][near]]))
     a, b = np.concatenate(edges, axis=1)
-    graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
-    _, piece = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
+    _, piece = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.argsort(-np.bincount(piece), kind="stable")
     number[measured] = np.argsort(order)[piece]
     return number
@@ -311,7 +308,7 @@ def body(
         samples[k] = points[:: max(1, len(points) // _SAMPLE)]
     newest = [0]
     while newest and waiting:
-        tree = cKDTree(np.concatenate([samples[k] for k in newest]))
+        tree = scipy.spatial.cKDTree(np.concatenate([samples[k] for k in newest]))
         newest = [k for k in waiting if tree.query(samples[k])[0].min() <= rules.join_m]
         waiting = [k for k in waiting if k not in newest]
         for k in newest:
@@ -351,7 +348,9 @@ def occlusion(
     )
     mask, own, depth_m = mask[at], own[at], depth_m[at]
     edge = _outline(mask)
-    row, column = distance_transform_edt(~own, return_distances=False, return_indices=True)
+    row, column = scipy.ndimage.distance_transform_edt(
+        ~own, return_distances=False, return_indices=True
+    )
     object_depth = depth_m[row, column][edge]
     outside = np.where(~mask & (depth_m > 0), depth_m, _FAR)
     nearest = _least(outside, rules.reach_px, _FAR)[edge]
@@ -362,7 +361,7 @@ def occlusion(
 def _inliers(points_m: Float[np.ndarray, "n 3"], rules: Rules) -> Bool[np.ndarray, " n"]:
     if len(points_m) <= rules.neighbours:
         return np.ones(len(points_m), dtype=bool)
-    distance, _ = cKDTree(points_m).query(points_m, k=rules.neighbours + 1)
+    distance, _ = scipy.spatial.cKDTree(points_m).query(points_m, k=rules.neighbours + 1)
     mean = distance[:, 1:].mean(axis=1)
     near: Bool[np.ndarray, " n"] = mean <= mean.mean() + rules.outlier_sds * mean.std()
     return near

@@ -4,8 +4,8 @@ import math
 from typing import Annotated
 
 import numpy as np
+import scipy  # imports its parts when they are used
 from annotated_types import Interval
-from scipy.ndimage import map_coordinates
 
 from qs3.geometry.cameras import Window
 from qs3.utils.settings import Positive, settings
@@ -71,5 +71,5 @@ class Misalignment:
         at_v = rows - self.rows_px * smooth_field(canvas, self.cell_px, rng)
         at_u = columns - self.columns_px * smooth_field(canvas, self.cell_px, rng)
         # Not OpenCV's cubic: it rounds places to 1/32 px, and is up to 0.05 px off on a ramp.
-        found = map_coordinates(image, [at_v, at_u], order=3, mode="grid-constant")
+        found = scipy.ndimage.map_coordinates(image, [at_v, at_u], order=3, mode="grid-constant")
         return np.maximum(found, 0)  # a spline undershoots beside bright dots
