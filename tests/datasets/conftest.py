@@ -79,7 +79,7 @@ def recorded():
     renderer = MitsubaRenderer(samples=1)
     rooms = {"scene0001_00": room(), "scene0007_01": room(chair=1)}
     return {
-        scene: (made, *record(made, poses(14), renderer, lost=LOST))
+        scene: (made, *record(made, poses(11), renderer, lost=LOST))
         for scene, made in rooms.items()
     }
 

@@ -221,13 +221,8 @@ def test_names_for_terminals_and_pages_are_printable(run, clouds, tmp_path, caps
 
 def test_a_prior_is_that_of_python(run, clouds, tmp_path):
     np.save(tmp_path / "a.npy", clouds)
-    out = tmp_path / "said.csv"
-    assert (
-        predict(
-            run, out, str(tmp_path / "a.npy"), "page=false", "prior=rod:8,ball:0", "prior_power=1"
-        )
-        == 0
-    )
+    out, words = tmp_path / "said.csv", ("page=false", "prior=rod:8,ball:0", "prior_power=1")
+    assert predict(run, out, str(tmp_path / "a.npy"), *words) == 0
     given = {"rod": 8, "ball": 0}
     expected = qs3.load(run, prior=given, prior_power=1)(clouds)
     np.testing.assert_allclose([probabilities(row) for row in table(out)], expected, atol=1e-6)
