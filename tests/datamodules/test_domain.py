@@ -14,10 +14,10 @@ from torch import nn
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.datamodules.domain import DomainData
-from qs3.datasets.domain import compose_domain
 from qs3.errors import ConfigError
 from qs3.geometry.sampling import unit_ball
 from qs3.store.store import PointSet, open_pointset
+from tests.composing import compose_domain
 from tests.training.search import Truth, search
 from tests.training.test_target_labels import TEST, TRAIN, truth_of, write_shuffled_target
 from tests.training.toy import CLASSES, TinyNet, write_domain

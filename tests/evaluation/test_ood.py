@@ -99,7 +99,7 @@ def test_a_cloud_with_as_many_points_as_the_net_sees_lacks_none():
 
 def test_of_clouds_in_metres_the_size_counts_too():
     rng = np.random.default_rng(0)
-    clouds = rng.normal(size=(300, 128, 3)).astype(np.float32)
+    clouds = rng.normal(size=(100, 128, 3)).astype(np.float32)
     ball, metres = (prepare(clouds, 64, scale=scale) for scale in ("unit_ball", "metres"))
     usual = limits(metres)
     assert {name: usual[name] for name in MEASURES} == limits(ball)
@@ -117,7 +117,7 @@ def test_of_clouds_in_metres_the_size_counts_too():
 
 def test_of_clouds_over_the_floor_the_lowest_point_counts_too():
     rng = np.random.default_rng(0)
-    clouds = rng.uniform(size=(300, 128, 3)).astype(np.float32)
+    clouds = rng.uniform(size=(100, 128, 3)).astype(np.float32)
     over = prepare(clouds, 64, scale="above_floor", floor=-1.0)
     assert measure_one(over, 7)["base"] == pytest.approx(clouds[7, :, 2].min() + 1, abs=1e-6)
     usual = limits(over)
@@ -130,7 +130,7 @@ def test_of_clouds_over_the_floor_the_lowest_point_counts_too():
 
 def test_what_is_strange_is_named():
     rng = np.random.default_rng(0)
-    ends = limits(domain(rng, 300, (1, 1, 1)))
+    ends = limits(domain(rng, 100, (1, 1, 1)))
     normal = rng.normal(size=(128, 3)).astype(np.float32)
 
     def reasons(cloud: np.ndarray) -> str:

@@ -62,6 +62,7 @@ NETS = {
     "dgcnn defrec": (lambda: dgcnn(3, k=5, variant="defrec"), 64),
     "dgcnn few points": (lambda: dgcnn(3, k=20), 16),
     "pointnet": (lambda: pointnet(3), 64),
+    "pointnet basic": (lambda: pointnet(3, variant="basic", norm="instance"), 64),
     "pointnet uda": (lambda: pointnet(3, variant="uda", norm="instance"), 64),
     "simpleview": (lambda: simpleview(3, image_size=32), 64),
     "simpleview nearest": (lambda: simpleview(3, image_size=32, pixel="nearest", up="z"), 64),
@@ -77,7 +78,7 @@ NETS = {
 }
 
 
-EACH = [pytest.param(name, marks=[pytest.mark.slow] * (name != "pointnet")) for name in NETS]
+EACH = [pytest.param(name, marks=[pytest.mark.slow] * (name != "pointnet basic")) for name in NETS]
 
 
 @pytest.mark.parametrize("name", EACH)
