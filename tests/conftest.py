@@ -1,7 +1,11 @@
 """What all tests share."""
 
+from __future__ import annotations
+
 import gc
 import os
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -38,3 +42,39 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """The collector need not look through the imported libraries again and again: they stay."""
     gc.collect()
     gc.freeze()
+
+
+# The toy of tests/training, for all tests. A fixture that modules import is made for each of them.
+
+
+@pytest.fixture(scope="session")
+def toy_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder `data` with the two toy domains, written once."""
+    from tests.training.toy import write_toy
+
+    folder = tmp_path_factory.mktemp("toy")
+    write_toy(folder / "data")
+    return folder / "data"
+
+
+@pytest.fixture
+def toy(toy_data: Path, tmp_path: Path):
+    """Composes the config of a toy run whose logs lie in this test's folder."""
+    from tests.training.toy import toy_config
+
+    def config(*more: str) -> Any:
+        return toy_config(tmp_path, f"paths.data_dir={toy_data}", *more)
+
+    return config
+
+
+@pytest.fixture(scope="session")
+def finished(toy_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the toy run with seed 0, never interrupted."""
+    from qs3.config import hashing
+    from qs3.training.command import train
+    from tests.training.toy import toy_config
+
+    cfg = toy_config(tmp_path_factory.mktemp("finished"), f"paths.data_dir={toy_data}")
+    train(cfg)
+    return hashing.run_folder(cfg)

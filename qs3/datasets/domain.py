@@ -111,8 +111,8 @@ class Domain:
                 f"data.scale={scale}: set {lacks} of domain {self.name}, if it is known"
             )
 
-    def check(self) -> None:
-        """Find out, in milliseconds, whether `open` has something to open.
+    def check(self) -> Importer | None:
+        """Find out, in milliseconds, whether `open` has something to open; returns `importer()`.
 
         Raises:
             MissingDataError: what was looked for, where to get it, and the commands.
@@ -140,6 +140,7 @@ class Domain:
             }
             text = "\n".join(f"{what}:\n  {how}" for what, how in lines.items() if how)
             raise MissingDataError(typed(text))
+        return importer
 
     def open(self, verify: bool = True) -> PointSet:
         """Open the dataset; the first time, bring the published files into the store.
@@ -148,8 +149,7 @@ class Domain:
             MissingDataError: as `check`.
             DataError: damaged files, or a store imported under other settings.
         """
-        self.check()
-        importer = self.importer()
+        importer = self.check()
         if not is_finished(self.folder):
             assert importer is not None  # `check` passed
             log.info("importing %s from %s", self.label, importer.root)

@@ -13,7 +13,6 @@ from qs3.engine.checkpointing import AtomicCheckpointIO, Clock
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from qs3.utils.processor import Moment
-from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.watching import interrupt
 
 GB = 1_000_000_000
@@ -28,7 +27,7 @@ def wind_forward(checkpoint):
     torch.save(content, checkpoint)
 
 
-def test_earlier_starts_count(toy):  # noqa: F811
+def test_earlier_starts_count(toy):
     cfg = toy("selftraining=none")
     interrupt(cfg, "on_train_epoch_start", 3)
     wind_forward(hashing.run_folder(cfg) / "last.ckpt")

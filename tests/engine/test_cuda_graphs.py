@@ -81,7 +81,7 @@ def test_steps_of_every_method_are_those_without_graphs(
 
 
 def _trained(name: str, *, graphs: bool) -> dict[str, Tensor]:
-    """Losses, weights and statistics of four steps of one batch size and one of another."""
+    """Losses, weights and statistics of three steps of one batch size and one of another."""
     torch.manual_seed(0)
     net = tiny_pointdan() if name == "pointdan" else tiny_net()
     method = CASES[name].make()
@@ -89,7 +89,7 @@ def _trained(name: str, *, graphs: bool) -> dict[str, Tensor]:
     optimizer = torch.optim.Adam([*net.parameters(), *method.parameters()], lr=1e-2)
     made = Graphs(net, Played) if graphs else None
     found = {}
-    for step, b in enumerate((6, 6, 6, 6, 4)):
+    for step, b in enumerate((6, 6, 6, 4)):
         if made is not None:
             made.begin_step()
         batch = batch_of(CASES[name], method, b, 32, CLASSES)

@@ -5,12 +5,11 @@ import shutil
 import pytest
 from omegaconf import OmegaConf
 
-from tests.training.conftest import finished, toy, toy_data  # noqa: F401
 from tests.training.toy import toy_config
 
 
 @pytest.fixture
-def run(finished, toy_data, tmp_path):  # noqa: F811
+def run(finished, toy_data, tmp_path):
     """A copy of the finished toy run (two rounds) with the files that the command line adds."""
     folder = tmp_path / "exp" / "seed0-0123abcd"
     shutil.copytree(finished, folder)

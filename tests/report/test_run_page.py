@@ -29,6 +29,7 @@ from tests.running import main
 from tests.training.toy import CLASSES
 
 ALL = ["curves"]
+NO_EPOCH = "epoch,phase,lr\n"  # of a history: nothing is drawn, which takes a while
 
 
 def texts(ax):
@@ -110,6 +111,7 @@ def test_a_net_that_has_diverged_has_a_page_that_browsers_read(run):
     p = read_predictions(run / "predictions.csv")
     lost = replace(p, probabilities=np.full_like(p.probabilities, np.nan))
     write_predictions(run / "predictions.csv", lost)
+    (run / "history.csv").write_text(NO_EPOCH)
     page = draw(run, embed=False).page.read_text()
     assert {one["sure"] for one in data_of(page)["clouds"]} == {None}
 
@@ -119,6 +121,7 @@ def test_unlabelled_target(run):
     final = Scores(n=metrics.final.n, predicted=metrics.final.predicted)
     rounds = [replace(record, with_target_labels=None) for record in metrics.rounds]
     change(run, final=final, rounds=rounds)
+    (run / "history.csv").write_text(NO_EPOCH)
     rows = table(run / "predictions.csv")
     with open(run / "predictions.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0].keys())
@@ -139,7 +142,7 @@ def test_unfinished_run_and_stale_pictures(run):
     assert list(drawn.pictures) == ["curves"]
     assert not (run / "pictures" / "embedding.png").exists()
     assert "not finished" in drawn.page.read_text()
-    (run / "history.csv").write_text("epoch,phase,lr\n")
+    (run / "history.csv").write_text(NO_EPOCH)
     assert "no epoch" in draw(run).skipped["curves"]
     with pytest.raises(MissingDataError):
         draw(run.parent)
@@ -188,11 +191,12 @@ def test_command_with_a_net_of_ones_own(run, toy_data, tmp_path, capsys):
 
 def test_missing_or_damaged_data_cost_their_pictures_and_not_the_page(run, toy_data, tmp_path):
     use_real_net(run)
+    (run / "history.csv").write_text(NO_EPOCH)
     data_dir = tmp_path / "copy"
     shutil.copytree(toy_data, data_dir)
     (data_dir / "kinectsim10" / "points.npy").write_bytes(b"no array")
     drawn = draw(run, data_dir=data_dir)
-    assert {*drawn.skipped} == {"embedding", "clouds"}
+    assert {*drawn.skipped} == {"curves", "embedding", "clouds"}
     assert "<li>embedding: " in drawn.page.read_text()
     assert "is not at" in draw(run, data_dir=tmp_path).skipped["clouds"]
     change(run, data=DataHashes(source="0" * 64, target="0" * 64))

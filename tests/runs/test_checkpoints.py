@@ -14,12 +14,11 @@ from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs import checkpoints
 from qs3.runs.checkpoints import load, save
 from tests.fixtures.harm import Harm
-from tests.training.conftest import finished, toy_data  # noqa: F401 (fixtures)
 
 KINDS = {"last.ckpt", "result.pt", "student.pt", "warmup_last.pt", "warmup_selected.pt"}
 
 
-def test_every_file_loads_without_unpickling_objects(finished):  # noqa: F811
+def test_every_file_loads_without_unpickling_objects(finished):
     files = [path for path in finished.rglob("*") if path.suffix in (".pt", ".ckpt")]
     assert {path.name for path in files} >= KINDS
     added = torch.serialization.get_safe_globals()  # by torch and by torch-geometric, for theirs
@@ -31,7 +30,7 @@ def test_every_file_loads_without_unpickling_objects(finished):  # noqa: F811
         torch.serialization.add_safe_globals(added)
 
 
-def test_student_result_and_checkpoint_have_the_same_weights(finished):  # noqa: F811
+def test_student_result_and_checkpoint_have_the_same_weights(finished):
     student = torch.load(finished / "student.pt", weights_only=True)
     result = torch.load(finished / "result.pt", weights_only=True)["weights"]
     last = torch.load(finished / "last.ckpt", weights_only=True)["state_dict"]

@@ -9,7 +9,6 @@ import pytest
 from qs3.errors import DataError
 from qs3.runs.metrics import METRICS, Evaluated, read_metrics, write_metrics
 from tests.report.made_runs import metrics, scores
-from tests.training.conftest import finished, toy, toy_data  # noqa: F401 (fixtures)
 
 TIERS = Evaluated(split="test", labels=True, norms="adabn", tiers={"hard": scores(0.25)})
 
@@ -24,7 +23,7 @@ def test_what_is_written_is_read(made, tmp_path):
     assert (tmp_path / METRICS).read_bytes() == first
 
 
-def test_a_real_run_is_read_and_written_alike(finished, tmp_path):  # noqa: F811
+def test_a_real_run_is_read_and_written_alike(finished, tmp_path):
     write_metrics(tmp_path, read_metrics(finished))
     assert (tmp_path / METRICS).read_bytes() == (finished / METRICS).read_bytes()
     assert len(read_metrics(tmp_path).rounds) == 2

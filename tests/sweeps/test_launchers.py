@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from qs3.config import hashing
 from tests.running import command
 from tests.sweeps.commands import light, light_runs
-from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
+from tests.training.conftest import result_of
 from tests.training.toy import CONF, overrides
 
 LAUNCHERS = {
@@ -76,7 +76,7 @@ def test_listed_jobs_in_parts(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", LAUNCHERS)
-def test_trainings(launcher, tmp_path, toy_data):  # noqa: F811
+def test_trainings(launcher, tmp_path, toy_data):
     """Two seeds train, another setting selects nothing; again, the finished ones are skipped."""
     words = [
         *overrides(tmp_path, f"paths.data_dir={toy_data}", *LAUNCHERS[launcher]),

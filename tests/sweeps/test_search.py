@@ -25,7 +25,6 @@ from qs3.training.command import judged, objective_of, train
 from qs3.utils.files import locked
 from tests.running import command
 from tests.sweeps.commands import light, light_runs
-from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.toy import CONF, overrides, write_domain
 
 SEARCH = "hparams_search=qbst_optuna"
@@ -133,7 +132,7 @@ def test_what_may_vary():
     check_varied(varied.values())
 
 
-def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
+def test_the_objective_is_what_the_validator_says(toy):
     """With `selection.student` the last epoch's score is the same one."""
     metrics = train(toy("selection.student=infomax", "selftraining.epochs=1"))
     only = metrics.student.score  # one epoch to choose from, and it is reported
@@ -143,7 +142,7 @@ def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
     assert objective_of(toy(), metrics) is None
 
 
-def test_a_run_that_really_diverges_is_finished_and_has_none(toy):  # noqa: F811
+def test_a_run_that_really_diverges_is_finished_and_has_none(toy):
     cfg = toy("selftraining=none", "protocol.optimizer.lr=1e30", "objective=snd")
     metrics = train(cfg)
     assert metrics.validators == dict.fromkeys(LABEL_FREE)
@@ -152,7 +151,7 @@ def test_a_run_that_really_diverges_is_finished_and_has_none(toy):  # noqa: F811
     assert judged(cfg, metrics).endswith("none: the net has diverged")
 
 
-def test_a_trial_says_its_objective_and_no_accuracy(toy, caplog):  # noqa: F811
+def test_a_trial_says_its_objective_and_no_accuracy(toy, caplog):
     """Nor when it was finished before; metrics.json has all."""
     words = ["selftraining=none", "protocol.epochs=1"]
     with caplog.at_level(logging.INFO):
@@ -269,7 +268,7 @@ def test_the_best_trial():
 
 
 @pytest.mark.slow
-def test_a_search_with_trainings(tmp_path, toy_data):  # noqa: F811
+def test_a_search_with_trainings(tmp_path, toy_data):
     words = [
         *overrides(tmp_path, f"paths.data_dir={toy_data}"), SEARCH, "hydra.sweeper.trials=3",
         "hydra.sweeper.at_once=2", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",

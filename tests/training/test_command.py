@@ -14,7 +14,7 @@ from qs3.config.hydra import build
 from qs3.training.run import run_of
 from qs3.utils.files import owned
 from tests.running import command
-from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
+from tests.training.conftest import result_of
 from tests.training.toy import CONF, overrides
 
 EXPERIMENTS = sorted(
@@ -109,7 +109,7 @@ def test_ddp_is_refused_in_a_multirun(tmp_path):
 
 
 @pytest.mark.slow
-def test_multirun_then_one_seed(tmp_path, toy_data):  # noqa: F811
+def test_multirun_then_one_seed(tmp_path, toy_data):
     arguments = overrides(tmp_path, f"paths.data_dir={toy_data}", "selftraining=none")
     sweep = command(tmp_path, *arguments, "report.pictures=auto", "seed=0,1", "-m")
     assert sweep.returncode == 0, sweep.stderr

@@ -111,7 +111,8 @@ def test_a_given_teacher_goes_on(toy, tmp_path, finished):
 @pytest.mark.parametrize("name", fast_are({"gast"}, METHODS))
 def test_every_method_goes_on_in_the_middle_of_the_warmup(toy, tmp_path, name):
     epochs = (1, 2) if name == "pcfea" else (1,)
-    check(toy, tmp_path, ("selftraining=none", *METHODS[name]), *epochs)
+    words = (f"protocol.epochs={epochs[-1] + 1}", "selftraining=none")
+    check(toy, tmp_path, (*words, *METHODS[name]), *epochs)
 
 
 def test_every_config_of_both_groups_is_tried():
