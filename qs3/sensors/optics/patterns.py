@@ -5,7 +5,7 @@ Kinect v1 pattern (3 x 3 tiles of 211 x 165 dots positions, about 11 % lit) enla
 ours have the same statistics and are drawn from a seed, so that nothing vendor-made is needed.
 """
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import cv2
@@ -40,9 +40,8 @@ class Speckle:
     @cached_property
     def slide(self) -> np.ndarray:
         """[rows * tiles * dot_px, columns * tiles * dot_px] float32, 0 dark or 1 lit."""
-        rng = np.random.default_rng([0x5BEC, self.seed])
         wanted = round(self.fill * self.rows * self.columns)
-        tile = _spaced_dots(self.rows, self.columns, wanted, self.spacing, rng)
+        tile = _spaced_dots(self.rows, self.columns, wanted, self.spacing, self.seed)
         assert 0 < tile.sum() == wanted, f"pattern.fill={self.fill}: {tile.sum()} dots of {wanted}"
         image = np.tile(tile, (self.tiles, self.tiles))
         return _frozen(image.repeat(self.dot_px, axis=0).repeat(self.dot_px, axis=1))
@@ -54,9 +53,8 @@ def _frozen(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _spaced_dots(
-    rows: int, columns: int, wanted: int, spacing: int, rng: np.random.Generator
-) -> np.ndarray:
+@lru_cache(maxsize=8)  # sensors that are built again have the same few patterns
+def _spaced_dots(rows: int, columns: int, wanted: int, spacing: int, seed: int) -> np.ndarray:
     """Random sequential placement on a torus, so that tiles join without a seam.
 
     Where no room is left for a dot it ends with fewer than the `wanted`, which are at least 1.
@@ -66,6 +64,7 @@ def _spaced_dots(
     placed = 0
     offsets = range(-spacing, spacing + 1)
     near = [[(column + i) % columns for i in offsets] for column in range(columns)]
+    rng = np.random.default_rng([0x5BEC, seed])
     for position in rng.permutation(rows * columns).tolist():
         if blocked[position]:
             continue
