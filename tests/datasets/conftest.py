@@ -1,10 +1,12 @@
 """Rooms of which everything is known, rendered and written once."""
 
+from dataclasses import replace
+
 import pytest
 
 from tests.composing import compose_domain
 from tests.datasets.rooms import poses, record, room, write_lists, write_scene
-from tests.fixtures.frame_files import Shot, Thing, write_nyuv2, write_sunrgbd
+from tests.fixtures.frame_files import SMALL, Shot, Thing, write_nyuv2, write_sunrgbd
 
 BOOKS = ((0, 0.02, 0.62, 0.5, 0.2, 0.2), (0.1, 0.02, 1.12, 0.5, 0.2, 0.2))
 LOST = (3, 8)
@@ -67,7 +69,8 @@ def nyuv2(shots, tmp_path_factory):
 def sunrgbd(shots, tmp_path_factory):
     """A data folder with published/sunrgbd."""
     root = tmp_path_factory.mktemp("sunrgbd")
-    write_sunrgbd(root / "published" / "sunrgbd", shots)
+    small = [replace(shot, **SMALL, rendered=()) for shot in shots]
+    write_sunrgbd(root / "published" / "sunrgbd", small)
     return root
 
 

@@ -57,7 +57,7 @@ def overrides_of(data_dir: Path, log_dir: Path) -> list[str]:
         f"paths.data_dir={data_dir}",
         f"paths.log_dir={log_dir}",
         *("num_classes=3", "model.k=6", "data.points=32", "data.fps_starts=1"),
-        *("protocol.epochs=2", "protocol.steps=null", "trainer.threads=1"),
+        *("protocol.epochs=1", "protocol.steps=null", "trainer.threads=1"),
         "logger=csv",
         "report.pictures=false",
     ]

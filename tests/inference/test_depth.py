@@ -16,7 +16,7 @@ from qs3.datasets.depth_images import Pinhole
 from qs3.datasets.pointed import point_out
 from qs3.errors import ConfigError, DataError
 from qs3.inference.model_file import read_result, write_result
-from tests.fixtures.frame_files import Shot, Thing, kinect
+from tests.fixtures.frame_files import SMALL, Shot, Thing, kinect
 from tests.inference.conftest import predict, probabilities, table
 
 SHOT = Shot(
@@ -26,8 +26,7 @@ SHOT = Shot(
     ],
     pitch_deg=14,
     roll_deg=3,
-    camera=(259.0, 259.5, 162.0, 126.0),
-    size=(240, 320),
+    **SMALL,
 )
 CAMERA = ",".join(map(str, SHOT.camera))
 UP = "up=" + ",".join(map(str, SHOT.up_in_camera))
