@@ -25,7 +25,7 @@ from qs3.report.comparison import against
 from qs3.report.comparison import text as compared_text
 from qs3.report.formats import markdown
 from qs3.report.spec import chosen
-from qs3.report.table import Table
+from qs3.report.table import Table, composed_of
 
 LAUNCHERS: Mapping[str, str | None] = {
     "basic": None,
@@ -131,7 +131,7 @@ def check_row(table: Table, name: str) -> None:
                 f"table={table.name}: its row {row!r} is not of {ALONE}, so it has other steps or "
                 "points than yours would have"
             )
-    cfg = composed("train", *next(c.overrides for c in table.rows[name] if c.overrides))
+    _, cfg = composed_of(next(cell for cell in table.rows[name] if cell.overrides))
     build(cfg.method)
 
 

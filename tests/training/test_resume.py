@@ -35,7 +35,7 @@ def slow(*values: str):
 @pytest.mark.parametrize(
     ("hook", "count"),
     [
-        ("on_train_start", 1),
+        slow("on_train_start", 1),
         ("on_train_batch_end", 2),  # before the first checkpoint
         slow("on_train_batch_end", 7),  # mid epoch 1
         slow("on_train_batch_end", 13),  # first epoch of round 0, weights just reset
