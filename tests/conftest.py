@@ -69,10 +69,10 @@ def toy(toy_data: Path, tmp_path: Path):
 @pytest.fixture(scope="session")
 def finished(toy_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the toy run with seed 0, never interrupted."""
-    from qs3.config import hashing
+    from qs3.config.hydra import run_folder
     from qs3.training.command import train
     from tests.training.toy import toy_config
 
     cfg = toy_config(tmp_path_factory.mktemp("finished"), f"paths.data_dir={toy_data}")
     train(cfg)
-    return hashing.run_folder(cfg)
+    return run_folder(cfg)

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from qs3.config import hashing
-from qs3.config.hydra import build
+from qs3.config.hydra import build, run_folder
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
 from tests.composing import compose
@@ -58,7 +57,7 @@ def test_experiment_runs(experiment, published, tmp_path):
         cfg.selftraining.rounds = 2
     metrics = train(cfg)
     assert metrics.experiment == experiment
-    assert metrics == read_metrics(hashing.run_folder(cfg))
+    assert metrics == read_metrics(run_folder(cfg))
     assert len(metrics.rounds) == min(rounds, 2)
     if experiment in ("own_scans", "own_meshes"):  # folders are no labels: all clouds are theirs
         assert (metrics.final.n, metrics.final.accuracy) == (60, None)

@@ -1,14 +1,18 @@
-"""What Hydra needs from us: resolvers, instantiation, plain errors.
+"""What Hydra needs from us: resolvers, instantiation, plain errors; and the hash of a config.
+
+The hash names a run's folder: the same command always finds its own run.
 
 Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
 `${qs3.tags:}`, `${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help texts
 `${qs3.choices:GROUP}`, `${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
 """
 
+import hashlib
 import itertools
+import json
 import re
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +23,40 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import ValidationError
 
-from qs3.config import hashing
 from qs3.config.location import CONF, PACKAGE, typed
-from qs3.errors import ConfigError, Qs3Error
+from qs3.errors import ConfigError, MissingDataError, Qs3Error
+from qs3.utils.files import sha256_file
 from qs3.utils.settings import problems
+
+# Keys that do not change a result: where things lie, what is shown, how data would be made, and the
+# seed, which is in the folder's name. Everything else is hashed, so two different runs never share
+# a folder. (Other data, wherever they lie, have another hash, which `started.json` guards.)
+_UNHASHED = (
+    "seed",
+    "paths",
+    "logger",
+    "hydra",
+    "force",
+    "callbacks.progress",
+    "report",
+    "objective",
+    "trainer.gpus",  # which of several GPUs trains a run
+    "trainer.cuda_graphs",  # the same kernels, started at once
+    "data.cache_dir",
+    "data.make_source",
+    *("method.file", "model.file"),  # their content matters, wherever they lie: .sha256
+    *(
+        f"data.{domain}.{key}"
+        for domain in ("source", "target")
+        for key in (
+            *("path", "twin_of", "title", "symbol", "unit"),
+            *("published.folder", "published.file", "published.on_error"),
+            *("synthesis", "how_to_get", "make", "stand_in"),
+        )
+    ),
+)
+_FROM_OUTSIDE = re.compile(r"\$\{\s*oc\.")
+_NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
 
 def _tags(*, _root_: DictConfig) -> ListConfig:
@@ -56,7 +90,7 @@ def component_names(cfg: DictConfig) -> dict[str, str]:
     }
     if file := cfg.method.get("file"):  # method=own
         names["method"] = Path(file).stem
-    if not hashing.has_rounds(OmegaConf.to_container(cfg.selftraining, resolve=False)):
+    if not has_rounds(OmegaConf.to_container(cfg.selftraining, resolve=False)):
         names["selftraining"] = "none"
     return names
 
@@ -64,7 +98,7 @@ def component_names(cfg: DictConfig) -> dict[str, str]:
 def _sha256(file: str | None) -> str:
     """Hash of a file; "" if there is none: the command that needs it raises."""
     try:
-        return hashing.file_sha256(file) if file else ""
+        return file_sha256(file) if file else ""
     except Qs3Error:
         return ""
 
@@ -102,9 +136,9 @@ _RESOLVERS: dict[str, Callable[..., Any]] = {
     "described": _described,
     "gpu_in_turn": _gpu_in_turn,
     "tags": _tags,
-    "run_name": lambda *, _root_: hashing.run_name(_root_),
+    "run_name": lambda *, _root_: run_name(_root_),
     "typed": typed,
-    "wandb_id": lambda *, _root_: hashing.run_name(_root_).replace("/", "-"),
+    "wandb_id": lambda *, _root_: run_name(_root_).replace("/", "-"),
 }
 for _name, _resolver in _RESOLVERS.items():
     OmegaConf.register_new_resolver(f"qs3.{_name}", _resolver, replace=True)
@@ -147,3 +181,93 @@ def cli_errors(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
 def in_multirun() -> bool:
     """Whether this job is one of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def config_sha256(cfg: DictConfig) -> str:
+    """64 hex digits over the composed config, without the keys that do not change a result.
+
+    Interpolations are hashed as they are written: what they point to is hashed at its own place,
+    or does not matter. But by its value is hashed what comes from outside of the config
+    (`${oc.env:NAME}`), or from a `selftraining` without rounds, which is not hashed itself; and a
+    method's or a model's file by its content.
+    """
+    plain: Any = OmegaConf.to_container(cfg, resolve=False)
+    for group in ("method", "model"):
+        if "sha256" in (plain.get(group) or {}):
+            plain[group]["sha256"] = cfg[group].sha256
+    for key in _UNHASHED:
+        _leave_out(plain, key)
+    plain.setdefault("callbacks", {})  # ~callbacks leaves nothing out
+    plain = _with_values(plain, cfg, "", _FROM_OUTSIDE)
+    if not has_rounds(plain.get("selftraining")):  # its other settings are not read
+        plain["selftraining"] = None
+        plain = _with_values(plain, cfg, "", _from(["selftraining"]))
+    trainer = plain.get("trainer")
+    devices = trainer.get("devices") if isinstance(trainer, dict) else None
+    if isinstance(devices, list) and len(devices) == 1:
+        trainer["devices"] = 1
+    text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def with_values(cfg: DictConfig, keys: Sequence[str]) -> Any:
+    """The config as nested dicts, with values in place of interpolations of these keys."""
+    return _with_values(OmegaConf.to_container(cfg, resolve=False), cfg, "", _from(keys))
+
+
+def file_sha256(file: str) -> str:
+    """Hash of a file that the config names; MissingDataError if it cannot be read."""
+    try:
+        return sha256_file(Path(file).expanduser())
+    except OSError as error:
+        raise MissingDataError(f"{file} cannot be read ({error})") from error
+
+
+def _leave_out(plain: Any, key: str) -> None:
+    """Take a key out of nested dicts, if it is there."""
+    *parents, leaf = key.split(".")
+    for parent in parents:
+        plain = plain.get(parent) if isinstance(plain, dict) else None
+    if isinstance(plain, dict):
+        plain.pop(leaf, None)
+
+
+def _from(keys: Sequence[str]) -> re.Pattern[str]:
+    """Finds interpolations of keys and what lies below: `${A}`, `${..A.b}`, `${oc.select:A.b}`."""
+    names = (re.escape(key).replace(r"\.", r"[.\[]") for key in keys)
+    return re.compile(rf"\$\{{[^}}]*(?<![\w\]]\.)(?<!\w)(?:{'|'.join(names)})\b")
+
+
+def _with_values(node: Any, cfg: DictConfig, place: str, which: re.Pattern[str]) -> Any:
+    """The same, with values in place of the interpolations that the pattern finds."""
+    if isinstance(node, dict):
+        begin = f"{place}." if place else ""
+        return {key: _with_values(v, cfg, f"{begin}{key}", which) for key, v in node.items()}
+    if isinstance(node, list):
+        return [_with_values(value, cfg, f"{place}[{i}]", which) for i, value in enumerate(node)]
+    if isinstance(node, str) and which.search(node):
+        found = OmegaConf.select(cfg, place)
+        return OmegaConf.to_container(found, resolve=True) if OmegaConf.is_config(found) else found
+    return node
+
+
+def config_hash(cfg: DictConfig) -> str:
+    """The first 8 digits of `config_sha256`, for names (`check_config` compares all 64)."""
+    return config_sha256(cfg)[:8]
+
+
+def has_rounds(selftraining: Any) -> bool:
+    """Whether a group `selftraining`, as nested dicts, does something."""
+    if not isinstance(selftraining, dict):
+        return False
+    return selftraining.get("_target_") != _NO_ROUNDS and selftraining.get("rounds") != 0
+
+
+def run_name(cfg: DictConfig) -> str:
+    """`<experiment_name>/seed<seed>-<hash>`, relative to `paths.log_dir`."""
+    return f"{cfg.experiment_name}/seed{cfg.seed}-{config_hash(cfg)}"
+
+
+def run_folder(cfg: DictConfig) -> Path:
+    """The folder of the run that `cfg` describes, whether it exists or not."""
+    return Path(cfg.paths.log_dir).resolve() / run_name(cfg)

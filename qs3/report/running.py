@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from qs3.config.compose import composed, override
-from qs3.config.hashing import file_sha256
-from qs3.config.hydra import build
+from qs3.config.hydra import build, file_sha256
 from qs3.config.location import python_command
 from qs3.errors import ConfigError
 from qs3.report.comparison import against

@@ -217,7 +217,7 @@ def composed_of(cell: Cell) -> tuple[tuple[str, str], DictConfig]:
 
 @functools.lru_cache(maxsize=4096)
 def _composed(words: tuple[str, ...], place: str) -> tuple[tuple[str, str], DictConfig]:
-    from qs3.config.hashing import config_hash
+    from qs3.config.hydra import config_hash
 
     cfg = composed("train", *words, place=place)
     return (str(cfg.experiment_name), config_hash(cfg)), cfg

@@ -32,8 +32,8 @@ from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, open_dict
 
-from qs3.config import hashing
 from qs3.config.compose import quoted
+from qs3.config.hydra import config_sha256, run_name
 from qs3.config.location import typed
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
@@ -150,7 +150,7 @@ class LabelFreeSearch(OverLauncher):
         from optuna.storages import JournalStorage
         from optuna.storages.journal import JournalFileBackend
 
-        which = [hashing.config_sha256(cfg), cfg.seed, cfg.objective, self.seed, self.random]
+        which = [config_sha256(cfg), cfg.seed, cfg.objective, self.seed, self.random]
         text = json.dumps([*which, {key: str(one) for key, one in sorted(space.items())}])
         name = f"{cfg.experiment_name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
         self.file = self.folder / f"{name}.journal"
@@ -284,7 +284,7 @@ def _tell(study: Study, trial: Trial, result: JobReturn) -> None:
     value, cfg = result.return_value, result.cfg
     assert isinstance(value, float)
     assert cfg is not None
-    trial.set_user_attr("run", hashing.run_name(cfg))
+    trial.set_user_attr("run", run_name(cfg))
     if math.isfinite(value):
         study.tell(trial, value)
     else:

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from omegaconf import OmegaConf
 from torch import nn
 
-from qs3.config import hashing
-from qs3.config.hydra import component_names
+from qs3.config.hydra import component_names, config_hash, config_sha256
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms, minimise_entropy
 from qs3.evaluation.ood import limits, ood_reasons_of_all, ood_share, source_limits
@@ -157,8 +156,8 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         student = StudentChoice(**choice.record(), last=of_last)
     return RunMetrics(
         experiment=cfg.experiment_name,
-        hash=hashing.config_hash(cfg),
-        config_sha256=hashing.config_sha256(cfg),
+        hash=config_hash(cfg),
+        config_sha256=config_sha256(cfg),
         seed=run.seed,
         source=data.labelled_domain.domain.name,
         target=run.target.name,

@@ -19,7 +19,7 @@ from typing import Any
 from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from qs3.config import hashing
+from qs3.config.hydra import config_sha256
 from qs3.errors import MissingDataError
 from qs3.runs import folder as runs
 from qs3.runs.metrics import RunMetrics
@@ -49,7 +49,7 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
         "commit": commit(),
         "files": files_sha256(run.cfg),
         "threads": torch.get_num_threads(),
-        "config_sha256": hashing.config_sha256(run.cfg),
+        "config_sha256": config_sha256(run.cfg),
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:
         first = runs.read_started(run.folder) or {}
@@ -131,7 +131,7 @@ def refuse_changed(run: Run, metrics: RunMetrics) -> None:
     Raises:
         DataError, ConfigError: names what it is.
     """
-    now = hashing.config_sha256(run.cfg)
+    now = config_sha256(run.cfg)
     runs.check_config(run.folder, metrics.config_sha256, now)
     used = {"source": run.source, "target": run.target}
     if run.is_upper_bound:

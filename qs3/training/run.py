@@ -8,8 +8,7 @@ from annotated_types import Ge, Interval
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import Field, Strict, ValidationError
 
-from qs3.config import hashing
-from qs3.config.hydra import build, in_multirun
+from qs3.config.hydra import build, in_multirun, run_folder
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError
@@ -132,7 +131,7 @@ def run_of(cfg: DictConfig) -> Run:
     scheme: SelfTrainingConfig = build(cfg.selftraining)
     return Run(
         cfg=cfg,
-        folder=hashing.run_folder(cfg),
+        folder=run_folder(cfg),
         scheme=scheme,
         phases=Phases(
             cfg.protocol.epochs,

@@ -25,7 +25,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig, OmegaConf
 
-from qs3.config import hashing
+from qs3.config.hydra import config_sha256, with_values
 from qs3.engine.loggers import HISTORY
 from qs3.errors import DataError
 from qs3.runs import folder as runs
@@ -41,10 +41,10 @@ _AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_na
 
 def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
     """64 hex digits over what a warm-up depends on (also `started.json`), except its seed."""
-    before = OmegaConf.create(hashing.with_values(cfg, _AFTERWARDS))
+    before = OmegaConf.create(with_values(cfg, _AFTERWARDS))
     for key in _AFTERWARDS:
         OmegaConf.update(before, key, None)
-    parts = [hashing.config_sha256(before), started["data"], started["versions"]]
+    parts = [config_sha256(before), started["data"], started["versions"]]
     parts += [started["threads"], started["files"]]  # sums are ordered by threads
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 

@@ -9,8 +9,7 @@ from annotated_types import Ge
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
-from qs3.config.hashing import config_hash
-from qs3.config.hydra import build
+from qs3.config.hydra import build, config_hash
 from qs3.errors import ConfigError
 from qs3.utils.settings import settings
 from tests.composing import compose

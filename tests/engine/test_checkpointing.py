@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.engine import checkpointing
 from qs3.engine.checkpointing import AtomicCheckpointIO, Clock
 from qs3.runs.checkpoints import load
@@ -30,7 +30,7 @@ def wind_forward(checkpoint):
 def test_earlier_starts_count(toy):
     cfg = toy("selftraining=none")
     interrupt(cfg, "on_train_epoch_start", 3)
-    wind_forward(hashing.run_folder(cfg) / "last.ckpt")
+    wind_forward(run_folder(cfg) / "last.ckpt")
     times = train(cfg).times
     assert LONG < times.seconds < 2 * LONG
     assert LONG < times.core_seconds < 2 * LONG

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.inference.model_file import read_result, write_result
 from qs3.inference.predictor import Predictor
 from qs3.training.command import train
@@ -67,7 +67,7 @@ def trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
     """Folder of a run with these settings beside `overrides_of`."""
     cfg = compose("train", [*overrides_of(data_dir, log_dir), *more])
     train(cfg)
-    return hashing.run_folder(cfg)
+    return run_folder(cfg)
 
 
 def table(path: Path) -> list[dict[str, str]]:

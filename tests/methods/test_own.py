@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional as F
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
-from qs3.config.hashing import config_hash
+from qs3.config.hydra import config_hash
 from qs3.datamodules.augment import rotate_z
 from qs3.errors import ConfigError, MissingDataError
 from qs3.methods.base import Method, total_loss

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import config_sha256, run_folder
 from qs3.errors import DataError, MissingDataError
 from qs3.inference.model_file import Result, write_result
 from qs3.models.pointnet import pointnet
@@ -220,9 +220,9 @@ def test_features_of_both_domains_on_the_plane_of_largest_variance():
 def test_training_draws_and_its_hash_does_not_know(toy):
     words = ("selftraining=none", "protocol.epochs=1")
     cfg = toy("report.pictures=true", *words)
-    assert hashing.config_sha256(cfg) == hashing.config_sha256(toy(*words))
+    assert config_sha256(cfg) == config_sha256(toy(*words))
     train(cfg)
-    pictures = hashing.run_folder(cfg) / "pictures"
+    pictures = run_folder(cfg) / "pictures"
     assert {p.name for p in pictures.iterdir()} == {
         *(f"{name}.png" for name in ALL), "index.html",
     }  # fmt: skip
@@ -243,7 +243,7 @@ def test_offline_wandb_gets_curves_and_pictures(toy, monkeypatch):
     monkeypatch.setattr(Run, "log", lambda run, row, *a: rows.append(row) or log(run, row, *a))
     cfg = toy("logger=wandb", "report.pictures=true")
     train(cfg)
-    folder = hashing.run_folder(cfg)
+    folder = run_folder(cfg)
     history = table(folder / "history.csv")
     losses = [row["train/loss"] for row in rows if "train/loss" in row]
     assert losses == pytest.approx([float(row["train/loss"]) for row in history])

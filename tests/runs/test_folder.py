@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
-from qs3.config import hashing
+from qs3.config.hydra import config_hash, config_sha256, run_name
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs import folder as runs
 from qs3.utils.files import owned
@@ -62,21 +62,21 @@ HASHED = (
 
 @pytest.mark.parametrize("key", [*IGNORED, *HASHED])
 def test_hash_sees_what_changes_the_result_and_nothing_else(key):
-    same = hashing.config_hash(config(**{key: 7})) == hashing.config_hash(config())
+    same = config_hash(config(**{key: 7})) == config_hash(config())
     assert same == (key in IGNORED)
 
 
 @pytest.mark.parametrize("none", [{"rounds": 0}, {"_target_": "qs3.datamodules.phases.no_rounds"}])
 def test_hash_ignores_settings_of_rounds_that_there_are_not(none):
     changes = {f"selftraining.{key}": value for key, value in none.items()}
-    expected = hashing.config_hash(config(**changes))
-    assert expected != hashing.config_hash(config())
-    assert hashing.config_hash(config(**changes, **{"selftraining.theta": 0.5})) == expected
+    expected = config_hash(config(**changes))
+    assert expected != config_hash(config())
+    assert config_hash(config(**changes, **{"selftraining.theta": 0.5})) == expected
 
 
 def test_another_config_or_other_data_are_refused():
-    whole = hashing.config_sha256(config())
-    assert hashing.config_hash(config()) == whole[:8]
+    whole = config_sha256(config())
+    assert config_hash(config()) == whole[:8]
     runs.check_config(Path("run"), whole, whole)
     for other in (whole[:8] + "0" * 56, None):
         with pytest.raises(ConfigError, match="run"):
@@ -88,7 +88,7 @@ def test_another_config_or_other_data_are_refused():
 
 def test_hash_does_not_depend_on_the_order_of_keys():
     backwards = OmegaConf.create(dict(reversed(BASE.items())))
-    assert hashing.config_hash(backwards) == hashing.config_hash(config())
+    assert config_hash(backwards) == config_hash(config())
 
 
 def test_what_a_run_was_started_with(tmp_path):
@@ -123,7 +123,7 @@ def test_clear_keeps_what_hydra_wrote(tmp_path):
 def test_which_commands_are_the_same_run():
     """The card that trains a run does not name it, and no search of its settings; ddp does."""
     whole, dann, searched, ddp, *gpus = (
-        hashing.run_name(compose("train", ["experiment=qs3_s2d", *words]))
+        run_name(compose("train", ["experiment=qs3_s2d", *words]))
         for words in (
             *([], ["method=dann"], ["hparams_search=qbst_optuna"]),
             *(["trainer=gpu", "trainer.devices=2"], ["trainer=gpu"], ["trainer=gpus_in_turn"]),

@@ -14,13 +14,12 @@ import os
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from qs3.config import hashing
-from qs3.config.hydra import cli_errors
+from qs3.config.hydra import cli_errors, config_hash, run_folder
 from qs3.errors import SelectionError
 
 
 def work(cfg: DictConfig) -> float:
-    folder = hashing.run_folder(cfg)
+    folder = run_folder(cfg)
     folder.mkdir(parents=True, exist_ok=True)
     if cfg.seed == 9:
         raise SelectionError("round 0: nothing is selected\nlower theta")
@@ -32,7 +31,7 @@ def work(cfg: DictConfig) -> float:
     found = {
         "devices": OmegaConf.to_container(cfg.trainer, resolve=True)["devices"],
         "theta": cfg.selftraining.theta,
-        "hash": hashing.config_hash(cfg),
+        "hash": config_hash(cfg),
         "pid": os.getpid(),
         "times": 1,
     }

@@ -8,7 +8,7 @@ import re
 import pytest
 from hydra import compose, initialize_config_dir
 
-from qs3.config import hashing
+from qs3.config.hydra import config_hash
 from tests.running import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import result_of
@@ -35,7 +35,7 @@ def test_gpus_in_turn_and_a_failure(launcher, tmp_path):
     }  # fmt: skip
     with initialize_config_dir(str(CONF), version_base="1.3"):
         one_gpu = compose("train", ["experiment=qs3_s2d", "trainer=gpu"])
-    assert {run["hash"] for run in found.values()} == {hashing.config_hash(one_gpu)}
+    assert {run["hash"] for run in found.values()} == {config_hash(one_gpu)}
     if launcher == "submitit_local":
         assert len({run["pid"] for run in found.values()}) == 2
         assert len(list(tmp_path.glob("logs/.submitit/*/*_log.out"))) == 3

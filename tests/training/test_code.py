@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.training import provenance as code
 from qs3.training.command import train
 from qs3.training.provenance import changed_files, files_sha256
@@ -62,4 +62,4 @@ def test_a_warm_up_of_a_net_that_was_edited_is_trained_again(own, toy, caplog):
         caplog.clear()
         train(cfg)
         assert ("the warm-up was trained before" in caplog.text) == taken
-        shutil.rmtree(hashing.run_folder(cfg))
+        shutil.rmtree(run_folder(cfg))

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.engine import cuda_graphs
 from qs3.engine.classifier import Classifier
 from qs3.runs.checkpoints import load
@@ -34,9 +34,9 @@ def test_a_run_is_the_same_with_graphs(
     assert Played.made >= 2  # in the rounds other ones than in the warm-up; two domains' passes
     assert plain.keys() == graphed.keys()
     assert all(torch.equal(plain[key], graphed[key]) for key in plain)
-    made, folder = Played.made, hashing.run_folder(config)
+    made, folder = Played.made, run_folder(config)
     config.trainer.cuda_graphs = False
-    assert hashing.run_folder(config) == folder  # no result depends on it
+    assert run_folder(config) == folder  # no result depends on it
     _weights(config)
     assert Played.made == made
 
@@ -44,4 +44,4 @@ def test_a_run_is_the_same_with_graphs(
 def _weights(config: Any) -> dict[str, torch.Tensor]:
     """Of the last student."""
     train(config)
-    return load(hashing.run_folder(config) / STUDENT)
+    return load(run_folder(config) / STUDENT)

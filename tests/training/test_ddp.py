@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.runs.checkpoints import load
 from qs3.store.store import open_pointset
 from qs3.training.command import train
@@ -63,7 +63,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     write_domain(root / "data", "kinectsim10", noise=0.15, train=25)
     cfg = toy_config(root, *SETTINGS)
     interrupt(cfg, "on_train_epoch_start", WARMUP)  # in the last epoch of the warm-up
-    one, two = hashing.run_folder(cfg), hashing.run_folder(toy_config(root, *SETTINGS, *TWO))
+    one, two = run_folder(cfg), run_folder(toy_config(root, *SETTINGS, *TWO))
     selected = load(one / "last.ckpt")["callbacks"]["WarmupSelection"]
     assert selected["accuracy"] == 1.0
     two.mkdir(parents=True)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import qs3
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.datamodules.clouds import load_clouds
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import predict
@@ -58,7 +58,7 @@ def test_equal_weights_predict_equal_clouds_once(toy, passes, more, nets):
     cfg = toy("force=true", *more)
     metrics = train(cfg)
     assert +passes == {"test": nets}
-    folder = hashing.run_folder(cfg)
+    folder = run_folder(cfg)
     predictions = read_predictions(folder / FILE)
     right = (predictions.predicted == predictions.labels).mean()
     assert metrics.final.accuracy == pytest.approx(right)
@@ -69,8 +69,8 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
     plain_metrics, metrics = train(plain), train(adapted)
     assert plain_metrics.evaluation.norms == "trained"
     assert metrics.evaluation.norms == "adabn"
-    before = load(hashing.run_folder(plain) / "result.pt")["weights"]
-    after = load(hashing.run_folder(adapted) / "result.pt")["weights"]
+    before = load(run_folder(plain) / "result.pt")["weights"]
+    after = load(run_folder(adapted) / "result.pt")["weights"]
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed >= {"norm.running_mean", "norm.running_var"}
     assert changed <= {"norm.running_mean", "norm.running_var", "norm.num_batches_tracked"}
@@ -116,7 +116,7 @@ def test_the_reported_probabilities_are_weighed_and_estimates_are_not(toy) -> No
     told = toy(*WORDS, "evaluation.prior={rod: 9, slab: 0}", "evaluation.prior_power=1.0")
     before, after = train(plain), train(told)
     of_plain, of_told = (
-        read_predictions(hashing.run_folder(cfg) / "predictions.csv") for cfg in (plain, told)
+        read_predictions(run_folder(cfg) / "predictions.csv") for cfg in (plain, told)
     )
     prior = read_prior({"rod": 9, "slab": 0}, CLASSES, power=1.0)  # toys are balanced
     expected = prior(of_plain.probabilities)
@@ -148,7 +148,7 @@ def factors_of(toy, uneven: Path, *words: str) -> tuple[np.ndarray, Path]:
     for more in ((), ("evaluation.prior={ball: 1}", "evaluation.prior_power=1.0")):
         cfg = toy(f"paths.data_dir={uneven}", *words, *more)
         train(cfg)
-        runs.append(hashing.run_folder(cfg))
+        runs.append(run_folder(cfg))
     plain, told = (read_predictions(run / "predictions.csv").probabilities for run in runs)
     ratio = told / plain
     return (ratio / ratio.max(axis=1, keepdims=True))[0], runs[1]
@@ -177,7 +177,7 @@ def test_a_student_has_met_its_pseudo_labels(toy, uneven: Path) -> None:
     metrics = train(cfg)
     counts = np.array([metrics.rounds[-1].selected[name] for name in CLASSES]) + 1.0
     both = (counts / counts.sum() + np.array([33, 17, 9]) / 59) / 2
-    assert read_result(hashing.run_folder(cfg)).learnt == pytest.approx(both)
+    assert read_result(run_folder(cfg)).learnt == pytest.approx(both)
 
 
 @pytest.mark.parametrize("words", ["rooms", "{unicorn: 2}", "{rod: -1}"])
@@ -185,4 +185,4 @@ def test_what_is_no_prior_ends_a_run_before_it_trains(toy, words: str) -> None:
     cfg = toy(*WORDS, f"evaluation.prior={words}")
     with pytest.raises(ConfigError, match="prior="):
         train(cfg)
-    assert not list(hashing.run_folder(cfg).glob("*.ckpt"))
+    assert not list(run_folder(cfg).glob("*.ckpt"))

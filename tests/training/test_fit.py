@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import config_sha256, run_folder
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training.command import train
@@ -64,13 +64,13 @@ def test_seed_1_alone_equals_seed_1_after_seed_0(toy, toy_data, tmp_path):
     for seed in (0, 1):  # as the basic launcher does: one process
         torch.manual_seed(123)
         train(toy(f"seed={seed}"))
-    after = result_of(hashing.run_folder(toy("seed=1")))
+    after = result_of(run_folder(toy("seed=1")))
     alone = toy("seed=1", f"paths.log_dir={tmp_path / 'alone'}")
     torch.rand(7)
     np.random.rand(3)  # noqa: NPY002 (disturbs the global state on purpose)
     train(alone)
-    assert result_of(hashing.run_folder(alone)) == after
-    zero = result_of(hashing.run_folder(toy("seed=0")))
+    assert result_of(run_folder(alone)) == after
+    zero = result_of(run_folder(toy("seed=0")))
     assert zero["history.csv"] != after["history.csv"]
 
 
@@ -78,7 +78,7 @@ def test_finished_run_is_skipped_and_force_repeats_it(toy, monkeypatch):
     words = ("selftraining=none", "method=source_only", "protocol.epochs=1")
     cfg = toy(*words)
     first = train(cfg)
-    folder = hashing.run_folder(cfg)
+    folder = run_folder(cfg)
     stamp = (folder / "last.ckpt").stat().st_mtime_ns
     assert train(cfg) == first
     assert (folder / "last.ckpt").stat().st_mtime_ns == stamp
@@ -140,7 +140,7 @@ def test_a_run_without_epochs_left_is_not_finished(toy):
     cfg = toy("selftraining=none", "trainer.limit_train_batches=0")
     with pytest.raises(ConfigError):
         train(cfg)
-    assert not (hashing.run_folder(cfg) / "metrics.json").exists()
+    assert not (run_folder(cfg) / "metrics.json").exists()
 
 
 def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
@@ -162,7 +162,7 @@ def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
 def test_two_runs_in_one_folder(toy):
     cfg = toy()
     with (
-        owned(hashing.run_folder(cfg)),
+        owned(run_folder(cfg)),
         pytest.raises(Qs3Error, match="another process is training"),
     ):
         train(cfg)
@@ -171,8 +171,8 @@ def test_two_runs_in_one_folder(toy):
 def test_other_settings_of_the_same_name_and_changed_data_are_refused(toy):
     cfg = toy("selftraining=none", "protocol.epochs=1")
     metrics = train(cfg)
-    folder = hashing.run_folder(cfg)
-    assert metrics.config_sha256 == hashing.config_sha256(cfg)
+    folder = run_folder(cfg)
+    assert metrics.config_sha256 == config_sha256(cfg)
     files = {name: (folder / name).read_text() for name in ("metrics.json", "started.json")}
     for place, error in (("config_sha256",), ConfigError), (("data", "target"), DataError):
         for name, text in files.items():
@@ -200,7 +200,7 @@ def damaged(data: Path) -> None:
 @pytest.mark.parametrize("ruin", [without, damaged])
 def test_an_old_result_stays_where_its_data_cannot_be_opened(toy, toy_data, tmp_path, ruin):
     """Such as of a mistyped folder: where data lie is no part of a run's name."""
-    folder = hashing.run_folder(toy())
+    folder = run_folder(toy())
     for name in ("metrics.json", "result.pt", "round_00/pseudo_labels.csv"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(name)
@@ -231,11 +231,11 @@ def change_started(folder, **changes) -> None:
 def test_a_run_that_other_software_began_warns(toy, finished, caplog):
     cfg = toy("paths.warmup_dir=null")
     interrupt(cfg, epoch=4)
-    change_started(hashing.run_folder(cfg), torch="1.0", threads=77)
+    change_started(run_folder(cfg), torch="1.0", threads=77)
     metrics = train(cfg)
     assert "begun with torch 1.0, threads 77, continued with torch" in caplog.text
     assert metrics.versions["torch"] == "1.0"
-    ours, theirs = result_of(hashing.run_folder(cfg)), result_of(finished)
+    ours, theirs = result_of(run_folder(cfg)), result_of(finished)
     for result in (ours, theirs):
         del result["metrics"]["versions"]
     assert ours == theirs
@@ -244,7 +244,7 @@ def test_a_run_that_other_software_began_warns(toy, finished, caplog):
 def test_a_checkpoint_with_a_flipped_bit_is_refused(toy):
     cfg = toy("paths.warmup_dir=null")
     interrupt(cfg, epoch=1)
-    own = hashing.run_folder(cfg) / "last.ckpt"
+    own = run_folder(cfg) / "last.ckpt"
     data = bytearray(own.read_bytes())
     data[len(data) // 2] ^= 1
     own.write_bytes(data)
@@ -256,7 +256,7 @@ def test_a_checkpoint_with_a_flipped_bit_is_refused(toy):
 def test_a_warm_up_of_two_versions_is_given_to_nobody(toy, changed, tmp_path, caplog):
     cfg = toy("selftraining=none", f"paths.warmup_dir={tmp_path / 'warmups'}")
     interrupt(cfg, epoch=1)
-    change_started(hashing.run_folder(cfg), **changed)
+    change_started(run_folder(cfg), **changed)
     train(cfg)
     assert ("begun with" in caplog.text) == bool(changed)
     assert (tmp_path / "warmups").exists() == (not changed)

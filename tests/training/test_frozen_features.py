@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import qs3
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.errors import ConfigError
 from qs3.inference.export import export_file, export_folder
 from qs3.models import features
@@ -62,13 +62,13 @@ def test_a_run_is_computed_once_goes_on_and_is_loaded(frozen, tmp_path, monkeypa
     interrupt(broken, epoch=2)
     assert asked == []  # features were there
     train(broken)
-    folder = hashing.run_folder(cfg)
-    assert result_of(hashing.run_folder(broken)) == result_of(folder)
+    folder = run_folder(cfg)
+    assert result_of(run_folder(broken)) == result_of(folder)
     assert all(name.startswith("head.") for name in load(folder / "student.pt"))
     assert qs3.load(folder).probabilities(torch.randn(3, 64, 3)).shape == (3, 3)
     (tmp_path / "net.onnx").rename(tmp_path / "moved.onnx")
     again = frozen(*words, f"paths.log_dir={tmp_path / 'whole'}", file=tmp_path / "moved.onnx")
-    assert hashing.run_folder(again) == folder
+    assert run_folder(again) == folder
 
 
 def test_the_file_is_found_from_another_folder(frozen, tmp_path, monkeypatch):
@@ -79,7 +79,7 @@ def test_the_file_is_found_from_another_folder(frozen, tmp_path, monkeypatch):
     train(cfg)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    folder = hashing.run_folder(cfg)
+    folder = run_folder(cfg)
     features._encoder.cache_clear()  # as in another process
     assert qs3.load(folder).probabilities(torch.randn(3, 64, 3)).shape == (3, 3)
     for how, out in ((export_file, "net.pt2"), (export_folder, "folder")):

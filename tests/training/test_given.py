@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.errors import ConfigError, DataError
 from qs3.inference.model_file import read_result, write_result
 from qs3.runs.checkpoints import load
@@ -19,7 +19,7 @@ ONLY_ROUNDS = ("selection.teacher=given", "protocol.epochs=1", "selftraining.ini
 def test_the_teacher_is_what_was_given(toy, finished):
     cfg = toy(*ONLY_ROUNDS, f"weights={finished}")
     metrics = train(cfg)
-    folder, before = hashing.run_folder(cfg), read_metrics(finished)
+    folder, before = run_folder(cfg), read_metrics(finished)
     given, kept = read_result(finished).weights, load(folder / "warmup_selected.pt")
     assert all(torch.equal(value, kept[name]) for name, value in given.items())
     assert metrics.warmup.selected.epoch == -1

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.runs.metrics import RunMetrics
 from qs3.runs.predictions import pseudo_labels_path, read_predictions, read_pseudo_labels
 from qs3.store.meta import ManifestRow
@@ -79,7 +79,7 @@ def data(tmp_path_factory) -> Path:
 def _trained(data: Path, folder: Path, case: tuple[str, ...]) -> tuple[Path, RunMetrics]:
     cfg = toy_config(folder, f"paths.data_dir={data}", *case)
     metrics = train(cfg)
-    return hashing.run_folder(cfg), metrics
+    return run_folder(cfg), metrics
 
 
 def _weights(file: Path) -> dict[str, torch.Tensor]:

@@ -10,8 +10,7 @@ import pytest
 import torch
 from omegaconf import open_dict
 
-from qs3.config import hashing
-from qs3.config.hydra import build
+from qs3.config.hydra import build, run_folder
 from qs3.datamodules.clouds import Clouds, load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
@@ -56,7 +55,7 @@ def kept_run(root: Path, toy_data: Path, *settings: str) -> Kept:
         cfg.callbacks.progress = {"_target_": target, "folder": str(root / "kept")}
     metrics = train(cfg)
     clouds = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", 32, scale="unit_ball")
-    return Kept(cfg, hashing.run_folder(cfg), root / "kept", metrics, clouds)
+    return Kept(cfg, run_folder(cfg), root / "kept", metrics, clouds)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import global_features, predict
@@ -77,7 +77,7 @@ SETTINGS = (
 def test_means_count_the_steps_of_the_optimiser(toy):
     cfg = toy("method=sd", *SETTINGS)
     train(cfg)
-    saved = load(hashing.run_folder(cfg) / "last.ckpt")
+    saved = load(run_folder(cfg) / "last.ckpt")
     batches = saved["loops"]["fit_loop"]["epoch_loop.batch_progress"]["total"]["completed"]
     assert batches % 4 == 2, "an epoch ends within a step"
     assert saved["global_step"] == 2 * -(-batches // 4)
@@ -90,9 +90,9 @@ def test_compiled_training_comes_to_the_same(toy):
     # dropout is drawn otherwise, so weights are alike and not equal
     changes = ("selftraining=none", "method=source_only", "protocol.epochs=2")
     plain, compiled = toy(*changes), toy(*changes, "compile=true")
-    assert hashing.run_folder(plain) != hashing.run_folder(compiled)
+    assert run_folder(plain) != run_folder(compiled)
     assert train(plain).final.n == train(compiled).final.n
-    a, b = (load(hashing.run_folder(cfg) / "student.pt") for cfg in (plain, compiled))
+    a, b = (load(run_folder(cfg) / "student.pt") for cfg in (plain, compiled))
     assert a.keys() == b.keys()  # names of weights stay
     for name in a:
         np.testing.assert_allclose(a[name], b[name], atol=0.3, err_msg=name)

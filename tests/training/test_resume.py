@@ -16,7 +16,7 @@ import qs3.runs.checkpoints
 import qs3.selftraining.callback
 import qs3.training.command
 import qs3.training.fit
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.engine.classifier import Classifier
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
@@ -51,8 +51,8 @@ def test_interrupted_in_a_hook(toy, finished, hook, count):
     cfg = toy()
     interrupt(cfg, hook, count)
     train(cfg)
-    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
-    ours = load(hashing.run_folder(cfg) / "last.ckpt")
+    assert result_of(run_folder(cfg)) == result_of(finished)
+    ours = load(run_folder(cfg) / "last.ckpt")
     theirs = load(finished / "last.ckpt")
     assert ours["state_dict"].keys() == theirs["state_dict"].keys()
     for name, value in theirs["state_dict"].items():
@@ -93,7 +93,7 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
         with pytest.raises(Stop):
             train(cfg)
     train(cfg)
-    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
+    assert result_of(run_folder(cfg)) == result_of(finished)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, cal
         with pytest.raises(Stop):
             train(cfg)
     train(cfg)
-    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
+    assert result_of(run_folder(cfg)) == result_of(finished)
 
 
 def test_sigterm_is_status_143_also_in_a_worker_of_a_sweep(toy, monkeypatch):
@@ -139,7 +139,7 @@ def test_sigterm_is_status_143_also_in_a_worker_of_a_sweep(toy, monkeypatch):
         with pytest.raises(SystemExit) as ended:
             train(cfg)
     assert ended.value.code == 143
-    assert not (hashing.run_folder(cfg) / "metrics.json").exists()
+    assert not (run_folder(cfg) / "metrics.json").exists()
 
 
 @pytest.mark.slow

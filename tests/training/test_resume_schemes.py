@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
@@ -63,9 +63,9 @@ def check(toy: Any, finished: Path, settings: tuple[str, ...], *epochs: int) -> 
     train(whole)  # unless it is `finished`
     for epoch in epochs:
         interrupt(broken, epoch=epoch)
-        assert load(hashing.run_folder(broken) / "last.ckpt")["epoch"] == epoch - 1
+        assert load(run_folder(broken) / "last.ckpt")["epoch"] == epoch - 1
     train(broken)
-    ours, theirs = hashing.run_folder(broken), hashing.run_folder(whole)
+    ours, theirs = run_folder(broken), run_folder(whole)
     assert result_of(ours) == result_of(theirs)
     files = [file for file in theirs.glob("*.pt") if file.name != "result.pt"]
     assert len(files) >= 3

@@ -14,7 +14,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.runs.checkpoints import load
 from qs3.training import shared_warmup
 from qs3.training.command import train
@@ -219,9 +219,9 @@ def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
     more = [f"selftraining={selftraining}", "selftraining.missing_class=warn"]
     alone = toy(*more, "paths.warmup_dir=null")
     train(alone)
-    expected = result_of(hashing.run_folder(alone))
-    weights = load(hashing.run_folder(alone) / "student.pt")
-    shutil.rmtree(hashing.run_folder(alone))
+    expected = result_of(run_folder(alone))
+    weights = load(run_folder(alone) / "student.pt")
+    shutil.rmtree(run_folder(alone))
     assert not shared_folders(tmp_path)
 
     train(toy("selftraining=none", "experiment_name=other"))
@@ -229,8 +229,8 @@ def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
     assert not taken(caplog)
     train(toy(*more))
     assert taken(caplog)
-    assert result_of(hashing.run_folder(alone)) == expected
-    again = load(hashing.run_folder(alone) / "student.pt")
+    assert result_of(run_folder(alone)) == expected
+    again = load(run_folder(alone) / "student.pt")
     assert all(torch.equal(weights[name], again[name]) for name in weights)
 
 

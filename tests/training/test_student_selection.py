@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.config import hashing
-from qs3.config.hydra import build
+from qs3.config.hydra import build, run_folder
 from qs3.datamodules.clouds import load_clouds
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
@@ -49,7 +48,7 @@ def by_rule(toy_data: Path, finished: Path, tmp_path_factory: pytest.TempPathFac
                 if rule == "pseudo_val":
                     patch.setattr(Classifier, "training_step", keep_and_train)
                 train(cfg)
-            folders[rule] = hashing.run_folder(cfg)
+            folders[rule] = run_folder(cfg)
         return folders[rule]
 
     return trained

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.config import hashing
+from qs3.config.hydra import run_folder
 from qs3.datamodules.clouds import Clouds
 from qs3.errors import DataError
 from qs3.runs.metrics import read_metrics
@@ -72,7 +72,7 @@ def test_own_scans_without_labels(toy, unlabelled, finished, more):
         theirs = read_metrics(finished)
         assert final.predicted == theirs.final.predicted
     assert "no labels to judge kinectsim10 (simulated) by; predicted " in headline(metrics)
-    assert train(cfg) == metrics == read_metrics(hashing.run_folder(cfg))
+    assert train(cfg) == metrics == read_metrics(run_folder(cfg))
 
 
 def test_without_a_test_split_predictions_of_the_training_clouds_are_counted(

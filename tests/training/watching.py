@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch import Callback
 from omegaconf import open_dict
 
-from qs3.config import hashing
+from qs3.config.hydra import config_hash
 from qs3.runs.checkpoints import copy_weights, save
 from qs3.training.command import train
 
@@ -164,6 +164,6 @@ def interrupt(
             "count": count,
             "epoch": epoch,
         }
-    assert hashing.config_hash(stopping) == hashing.config_hash(cfg)
+    assert config_hash(stopping) == config_hash(cfg)
     with pytest.raises(Stop):
         train(stopping)
