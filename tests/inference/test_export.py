@@ -209,7 +209,8 @@ class Forgetful(nn.Module):
 @pytest.mark.parametrize(
     ("net", "suffix"),
     [
-        (Waits(), "onnx"), (Waits(), "pt2"), (Forgetful(2e-4), "onnx"),
+        pytest.param(Waits(), "onnx", marks=pytest.mark.slow),
+        (Waits(), "pt2"), (Forgetful(2e-4), "onnx"),
         (Forgetful(float("nan")), "pt2"), (Waits(), "h5"),
     ],
 )  # fmt: skip
