@@ -52,7 +52,11 @@ def test_fixtures_cover_every_domain():
     assert sorted(fixtures._writers(Path(), SPLITS, True)) == NAMES
 
 
-@pytest.mark.parametrize("name", NAMES)
+# nyuv2: test_frames opens it on fewer frames
+EACH = [pytest.param(n, marks=pytest.mark.slow if n == "nyuv2" else ()) for n in NAMES]
+
+
+@pytest.mark.parametrize("name", EACH)
 def test_every_domain_opens_on_its_fixture(tmp_path, name):
     splits = {"train": 1, "test": 1} if name in FRAMES else SPLITS
     fixtures.write_domain(name, tmp_path, splits)
