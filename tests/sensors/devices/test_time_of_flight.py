@@ -29,8 +29,9 @@ def rays(frame):
     return np.sqrt(1 + x * x + y * y)
 
 
-@pytest.mark.parametrize("albedo", [0.2, 0.8])
-@pytest.mark.parametrize("frequencies", [(16e6,), (80e6, 16e6)], ids=["one", "two"])
+@pytest.mark.parametrize(
+    ("albedo", "frequencies"), [(0.2, (16e6,)), (0.8, (80e6, 16e6))], ids=["one", "two"]
+)
 def test_noise_and_bias_follow_the_stated_law(renderer, albedo, frequencies):
     camera = replace(CAMERA, frequencies_hz=frequencies)
     seen = []
