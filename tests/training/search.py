@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 _WINDOW_FROM = 40  # labels; shorter runs of them turn up in other numbers by chance
+_STRANGERS = ("_pytest", "pytest", "pluggy", "numba")  # a kernel holds types, and no arrays
 _NOT_ENTERED = (types.ModuleType, type, logging.Logger, logging.Handler, types.BuiltinMethodType)
 
 
@@ -151,7 +152,7 @@ def _outside(thing: Any) -> bool:
     return (
         thing is None
         or isinstance(thing, (*_NOT_ENTERED, str, bytes, int, float))
-        or type(thing).__module__.partition(".")[0] in ("_pytest", "pytest", "pluggy")
+        or type(thing).__module__.partition(".")[0] in _STRANGERS
     )
 
 
