@@ -234,15 +234,17 @@ def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
     assert all(torch.equal(weights[name], again[name]) for name in weights)
 
 
-def test_a_flipped_bit_is_no_warm_up(tmp_path, caplog):
+def test_a_damaged_one_is_no_warm_up(tmp_path, caplog):
     warmups = tmp_path / "warmups"
     give(warmups, started(tmp_path / "first"))
     (where,) = warmups.iterdir()
-    for name in ("history.csv", "last.ckpt"):
+    for i, name in enumerate(("history.csv", "last.ckpt", "last.ckpt", "started.json")):
         whole = (where / name).read_bytes()
-        (where / name).write_bytes(flipped(whole))
+        (where / name).write_bytes(flipped(whole) if i < 2 else b"{")
+        if i == 2:
+            (where / name).unlink()
         caplog.clear()
-        assert not one_that_takes(tmp_path / name, warmups).take()
+        assert not one_that_takes(tmp_path / str(i), warmups).take()
         assert f"the warm-up in {where} is damaged: it is trained again" in caplog.text
         (where / name).write_bytes(whole)
     assert one_that_takes(tmp_path / "whole", warmups).take()
