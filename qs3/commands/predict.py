@@ -65,7 +65,7 @@ def predict(
         qs3 predict ckpt=RUN depth=a.npy box=210,95,480,430 intrinsics=cam.yaml up=0,-0.97,-0.24
     """
     from qs3.evaluation.unlabelled import in_words
-    from qs3.inference import inputs, model_file, table
+    from qs3.inference import inputs, model_file
     from qs3.inference import page as pages
     from qs3.inference import predict as steps
     from qs3.inference.predictor import load
@@ -87,8 +87,8 @@ def predict(
         assert input is not None
         found = inputs.clouds(input, up or "z", part, first.classes)
     else:
-        pictures = (depth, mask, box, intrinsics, depth_scale, up, first.result.gravity)
-        found = inputs.depth_images(*pictures)
+        gravity = first.result.gravity
+        found = inputs.depth_images(depth, mask, box, intrinsics, depth_scale, up, gravity)
     samples, shown, began = [], [], time.monotonic()
     with progress_bar(f"{found.kind}s read", total=len(found.units)) as advance:
         settings = (first.floor(floor), opinion, batch_size, threads or len(cores()), advance)
@@ -99,7 +99,7 @@ def predict(
                 shown = pages.first_of(shown, first.classes)
     rate = len(samples) / max(time.monotonic() - began, 1e-9)
     notes = steps.notes(first, found.kind, floor is not None)
-    data, worth = steps.trained_on(name), first.result.worth
+    data, worth = first.result.data, first.result.worth
     verdict = in_words(steps.expected(samples, first))
     lines = [
         *([] if ckpt else [f"classifier: {name}, which comes with qs3 (ckpt=)"]),
@@ -112,7 +112,7 @@ def predict(
         *([f"accuracy on real objects: {worth}"] if worth else []),
         f"saved {out}",
     ]
-    write_text(out, table.as_csv(samples, first.classes))
+    write_text(out, steps.as_csv(samples, first.classes))
     if page:
         about = {"trained_on": data, "worth": worth, "notes": notes, "verdict": verdict}
         html = pages.page(

@@ -70,6 +70,7 @@ class Result:
         weights: of the net.
         floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
         worth: accuracy on real objects, in a sentence; "" if it was not measured.
+        data: what its source and target are made of, in a sentence; "" if that is not known.
         held_out: what it is on held-out labelled clouds, see `qs3.evaluation.unlabelled`; None if
             nothing is known.
         learnt: shares of the classes in its training, see `qs3.evaluation.unlabelled`; likewise.
@@ -86,6 +87,7 @@ class Result:
     weights: dict[str, Tensor]
     floor_m: float | None = None
     worth: str = ""
+    data: str = ""
     held_out: HeldOut | None = None
     learnt: tuple[Annotated[float, Gt(0)], ...] | None = None
 

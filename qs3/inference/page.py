@@ -10,12 +10,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from qs3.evaluation.ood import MEASURES, OF_HEIGHTS, OF_METRES
 from qs3.inference.inputs import Sample
-from qs3.inference.table import DISPUTED, STRANGE, disputed, kinds, right, scores
-from qs3.utils.page import confusion_rows, render
+from qs3.inference.predict import DISPUTED, STRANGE, disputed, kinds, right, scores
+from qs3.utils.page import render
 from qs3.utils.pictures import cloud_image, png, unit, value_image
 
 MOST_SHOWN = 300
@@ -96,6 +96,20 @@ def page(
         confusion=confusion_rows(found.confusion, classes) if found else [],
         **{"trained_on": "", "worth": "", "notes": (), "verdict": "", **about},
     )
+
+
+def confusion_rows(matrix: Int[np.ndarray, "c c"], classes: Sequence[str]) -> list[dict[str, Any]]:
+    """A confusion matrix for the templates: the classes that occur; darker is more of the row."""
+    there = [k for k in range(len(classes)) if matrix[k].sum() or matrix[:, k].sum()]
+    rows = []
+    for i in there:
+        total, cells = int(matrix[i].sum()), []
+        for j in there:
+            colour = "58,143,92" if i == j else "181,64,58"
+            share = 0.75 * matrix[i, j] / max(total, 1)
+            cells.append((int(matrix[i, j]), f"rgba({colour},{share:.2f})", i == j))
+        rows.append({"name": classes[i], "cells": cells, "hits": int(matrix[i, i]), "total": total})
+    return rows
 
 
 def _collapsed(predicted: Sequence[Sample]) -> str:

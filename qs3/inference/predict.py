@@ -1,25 +1,35 @@
-"""`qs3 predict`: clouds predicted in batches by several threads, and what is printed about them."""
+"""`qs3 predict`: clouds predicted in batches by several threads, their table and their scores."""
 
 import contextlib
 import itertools
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Int
 
 from qs3.datasets.pointed import LEVEL, PLANES
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError
 from qs3.evaluation.ood import other_units
 from qs3.evaluation.unlabelled import expected_accuracy
 from qs3.inference.inputs import Sample
-from qs3.inference.model_file import find_result
 from qs3.inference.predictor import Predictor, load
-from qs3.inference.table import Count, disputed, scores
 from qs3.kernels.norms import use_trained
-from qs3.runs.metrics import read_metrics
+from qs3.utils.text_table import csv_text
+
+COLUMNS = (
+    *("file", "status", "class", "confidence", "second", "label", "points", "dropped", "tier"),
+    *("caution", "up", "out_of_range", "reason"),
+)
+STRANGE = "unlike training"
+"""The kind of what is out of the range of training's clouds."""
+
+DISPUTED = "another classifier disagrees"
+"""The kind of what a second classifier calls otherwise."""
 
 _SHOWN = 10  # failures in the text for the terminal
 
@@ -95,15 +105,6 @@ def expected(samples: Sequence[Sample], predictor: Predictor) -> float | None:
     return expected_accuracy(predictor.result.held_out, np.array(plain)) if plain else None
 
 
-def trained_on(name: str) -> str:
-    """What the data of the classifier's run are made of; "" where that is not known."""
-    try:
-        metrics = read_metrics(find_result(name).parent)
-    except DataError:  # no prediction depends on it
-        return ""
-    return metrics.data_text if metrics else ""
-
-
 def notes(predictor: Predictor, kind: str, floor_known: bool) -> list[str]:
     """What is taken for granted about the clouds, for terminal and page."""
     found = [predictor.prior.words] if predictor.prior else []
@@ -115,6 +116,101 @@ def notes(predictor: Predictor, kind: str, floor_known: bool) -> list[str]:
     if predictor.result.gravity == "none" and kind != "depth image":
         found.append("the classifier knows clouds in the frame of their camera, not z up")
     return found
+
+
+def as_csv(samples: Sequence[Sample], classes: Sequence[str]) -> str:
+    """A line each, with a column for each class."""
+    lines: list[list[Any]] = [[*COLUMNS, *(f"p_{name}" for name in classes)]]
+    for one in samples:
+        status, sure, strange, each = "failed", None, "", [None] * len(classes)
+        if one.probabilities is not None:
+            status, sure, each = "ok", one.confidence, one.probabilities.tolist()
+            strange = "yes" if one.reason else "no"
+        cautions = "; ".join(caution.words for caution in one.cautions)
+        row = [one.name, status, one.cls, sure, one.second, one.label, one.points, one.dropped]
+        lines.append([*row, one.tier, cautions, one.up, strange, one.reason, *each])
+    return csv_text(lines)
+
+
+def right(one: Sample, classes: Sequence[str]) -> bool | None:
+    """Whether the net is right; None if there is no prediction, or no label of its classes."""
+    return one.cls == one.label if one.cls and one.label in classes else None
+
+
+def disputed(one: Sample) -> bool:
+    """Whether a second classifier was asked, and names another class."""
+    return bool(one.cls and one.second) and one.cls != one.second
+
+
+def kinds(one: Sample) -> list[str]:
+    """What was wrong with a cloud, or with what is said of it, in a few words each."""
+    strange = [STRANGE] * bool(one.cls and one.reason)
+    return [*(caution.kind for caution in one.cautions), *strange, *[DISPUTED] * disputed(one)]
+
+
+class Count(NamedTuple):
+    """So many right of so many."""
+
+    right: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """In [0, 1]; 0 of none."""
+        return self.right / max(self.of, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores of the samples with a prediction and a label that is one of the net's classes."""
+
+    all: Count
+    balanced: float  # mean over the classes that are there of the share that is right
+    majority: tuple[str, int]  # the commonest label, and how many have it
+    confidence: float  # mean over all of them
+    tiers: dict[str, Count]
+    kinds: dict[str, tuple[Count, Count]]  # by what was wrong with a cloud: with it, without it
+    confusion: Int[np.ndarray, "c c"]  # how often each label (row) was called each class
+    unknown: dict[str, int]  # labels that are not among the net's classes, and how often
+    unlabelled: int
+
+
+def scores(samples: Sequence[Sample], classes: Sequence[str]) -> Scores | None:
+    """The figures; None if no sample has both a prediction and a label of the net's classes."""
+    predicted = [one for one in samples if one.cls]
+    judged = [one for one in predicted if one.label in classes]
+    if not judged:
+        return None
+
+    def count(some: Iterable[Sample]) -> Count:
+        values = [one.cls == one.label for one in some]
+        return Count(sum(values), len(values))
+
+    confusion = np.zeros((len(classes), len(classes)), dtype=np.int64)
+    for one in judged:
+        confusion[classes.index(one.label), classes.index(one.cls)] += 1
+    totals = confusion.sum(axis=1)
+    every = Counter(kind for one in judged for kind in {*kinds(one)})
+    return Scores(
+        count(judged),
+        float((confusion.diagonal()[totals > 0] / totals[totals > 0]).mean()),
+        Counter(one.label for one in judged).most_common(1)[0],
+        float(np.mean([one.confidence for one in judged])),
+        {
+            tier: count(one for one in judged if one.tier == tier)
+            for tier in sorted({one.tier for one in judged} - {""})
+        },
+        {
+            kind: (
+                count(one for one in judged if kind in kinds(one)),
+                count(one for one in judged if kind not in kinds(one)),
+            )
+            for kind, _ in every.most_common()
+        },
+        confusion,
+        dict(Counter(one.label for one in predicted if one.label and one.label not in classes)),
+        sum(not one.label for one in predicted),
+    )
 
 
 def summary(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:

@@ -22,6 +22,7 @@ from qs3.datasets.domain import Domain
 from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
+from qs3.inference.page import confusion_rows
 from qs3.report import run_charts
 from qs3.report.datasets import opened_domain, part_of
 from qs3.report.viewer import Part, viewer
@@ -32,7 +33,7 @@ from qs3.runs.predictions import Predictions, read_predictions
 from qs3.store.meta import is_finished
 from qs3.store.store import PointSet
 from qs3.utils.files import make_folder, write_text
-from qs3.utils.page import confusion_rows, render
+from qs3.utils.page import render
 from qs3.utils.pictures import save_png
 from qs3.utils.seeding import derive
 

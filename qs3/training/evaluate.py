@@ -144,8 +144,6 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
 
     scores = {name: evaluation.scores_of(reported(path)) for name, path in files.items()}
     predictions = evaluation.predictions_of(reported(file))
-    if built.trainer.is_global_zero:
-        _write(run, loaded, nets, file, learnt, predictions)
     prior, parts, student, training = prior_of(file), component_names(cfg), None, None
     if cfg.data.clouds_a_class is not None:
         hits = nets.of("labelled", file).argmax(axis=1) == data.labelled.labels.numpy()
@@ -154,7 +152,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     if choice is not None:
         of_last = EpochScores(epoch=run.phases.total - 1, scores=scores["student"])
         student = StudentChoice(**choice.record(), last=of_last)
-    return RunMetrics(
+    metrics = RunMetrics(
         experiment=cfg.experiment_name,
         hash=config_hash(cfg),
         config_sha256=config_sha256(cfg),
@@ -204,6 +202,9 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         versions=loaded.started["versions"]
         | ({"commit": commit} if (commit := loaded.started.get("commit")) else {}),
     )
+    if built.trainer.is_global_zero:
+        _write(run, loaded, nets, file, learnt, predictions, metrics.data_text)
+    return metrics
 
 
 def _selection(
@@ -256,7 +257,13 @@ def without_labels(
 
 
 def _write(
-    run: Run, loaded: Loaded, nets: SavedNets, file: Path, learnt: Shares, predictions: Predictions
+    run: Run,
+    loaded: Loaded,
+    nets: SavedNets,
+    file: Path,
+    learnt: Shares,
+    predictions: Predictions,
+    made_of: str,
 ) -> None:
     """What is reported, with all that using it elsewhere takes, and what it predicts."""
     cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
@@ -278,6 +285,7 @@ def _write(
         usual=limits(data.all_labelled, data.target),
         weights=copy_weights(nets(file)),
         floor_m=None if floor is None else float(floor),
+        data=made_of,
         held_out=known,
         learnt=tuple(learnt.tolist()),
     )

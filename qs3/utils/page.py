@@ -5,12 +5,8 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from jaxtyping import Int
 
 from qs3.utils.version import VERSION
 
@@ -23,20 +19,6 @@ _TEMPLATES = Path(__file__).with_name("templates")
 def render(template: str, **values: Any) -> str:
     """A page or a text from a template, such as "run.html"; values are never taken for HTML."""
     return _environment().get_template(f"{template}.j2").render(**values)
-
-
-def confusion_rows(matrix: Int[np.ndarray, "c c"], classes: Sequence[str]) -> list[dict[str, Any]]:
-    """A confusion matrix for the templates: the classes that occur; darker is more of the row."""
-    there = [k for k in range(len(classes)) if matrix[k].sum() or matrix[:, k].sum()]
-    rows = []
-    for i in there:
-        total, cells = int(matrix[i].sum()), []
-        for j in there:
-            colour = "58,143,92" if i == j else "181,64,58"
-            share = 0.75 * matrix[i, j] / max(total, 1)
-            cells.append((int(matrix[i, j]), f"rgba({colour},{share:.2f})", i == j))
-        rows.append({"name": classes[i], "cells": cells, "hits": int(matrix[i, i]), "total": total})
-    return rows
 
 
 @functools.cache

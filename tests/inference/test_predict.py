@@ -18,7 +18,7 @@ from qs3.geometry.sampling import surface_sample
 from qs3.inference import inputs, model_file
 from qs3.inference.export import export_folder
 from qs3.inference.model_file import read_result, write_result
-from qs3.inference.table import DISPUTED
+from qs3.inference.predict import DISPUTED
 from qs3.runs.metrics import read_metrics
 from qs3.runs.predictions import read_predictions
 from qs3.store.store import open_pointset
