@@ -78,7 +78,9 @@ class Points:
                 path, _, flags = values
                 touched = str(path).startswith(self.folder) and flags & (os.O_WRONLY | os.O_RDWR)
             else:
-                named = ("os.rename", "os.remove", "os.mkdir", "os.rmdir")
+                named = ["os.rename", "os.mkdir"]
+                if self.how == "kill":  # to remove something takes no space
+                    named += ["os.remove", "os.rmdir"]
                 touched = event in named and str(values[0]).startswith(self.folder)
             if touched:
                 self()

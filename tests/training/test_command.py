@@ -12,7 +12,6 @@ from hydra import compose, initialize_config_dir
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
 from qs3.training.run import run_of
-from qs3.utils.files import owned
 from tests.running import command
 from tests.training.conftest import result_of
 from tests.training.toy import CONF, overrides
@@ -76,36 +75,11 @@ def test_missing_data_are_named_before_anything_heavy_is_imported(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_start_that_fails_leaves_no_folder_and_touches_no_other(tmp_path):
-    words = "experiment=qs3_s2d", "method=supervised"
-    assert command(tmp_path, *words).returncode == 1
-    logs = tmp_path / "logs"
-    assert list(logs.iterdir()) == []
-    (folder,) = _failed(tmp_path, *words)
-    (folder / "notes.txt").write_text("mine")
-    assert command(tmp_path, *words).returncode == 1
-    assert {path.name for path in folder.iterdir()} >= {"notes.txt", "train.log", ".hydra"}
-    (folder / "notes.txt").unlink()
-    with owned(folder):  # another process that has only just begun
-        assert command(tmp_path, *words).returncode == 1
-    assert (folder / "train.log").is_file()
-    assert command(tmp_path, *words).returncode == 1
-    assert not folder.parent.exists()
-
-
-def _failed(tmp_path, *words):
-    """The folder of a job of a sweep, which stays: the summary names it."""
-    assert command(tmp_path, *words, "-m").returncode == 1
-    return [path.parent for path in (tmp_path / "logs").glob("*/*/train.log")]
-
-
-@pytest.mark.slow
-def test_ddp_is_refused_in_a_multirun(tmp_path):
-    result = command(
-        tmp_path, "experiment=qs3_s2d", "trainer=gpu", "trainer.strategy=ddp", "seed=0,1", "-m"
-    )
+def test_ddp_is_refused_in_a_multirun(tmp_path, toy_data):
+    words = overrides(tmp_path, f"paths.data_dir={toy_data}", "trainer.strategy=ddp", "seed=0,1")
+    result = command(tmp_path, *words, "trainer.devices=2", "-m")
     assert result.returncode == 1
-    assert "hydra/launcher=joblib" in result.stderr
+    assert "(DDP)" in result.stderr
 
 
 @pytest.mark.slow
