@@ -145,8 +145,7 @@ def test_a_node_and_a_worker_are_killed(nodes, meshes, whole, tmp_path, shared):
     assert "Ray: 3 nodes, 3 cores" in said
     # A task on a node that goes away is one of a lost node or of a process that ended, whichever
     # Ray notices first.
-    again = re.findall(r"(\d+) times? a \w+ (?:was lost|ended); what it had was done again", said)
-    assert sum(map(int, again)) >= 2, said
+    assert len(re.findall(r": (?:a node was lost|its process ended) \(", said)) >= 2, said
     assert fingerprint(tmp_path / "specklenet10") == whole
 
 

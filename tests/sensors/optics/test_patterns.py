@@ -24,7 +24,7 @@ def test_the_default_slide_has_the_size_and_fill_of_the_released_one():
 def test_dots_keep_their_distance_across_the_seams_of_tiles(columns, rows, spacing, seed):
     fill = 0.25 / (1 + spacing) ** 2  # so few find room in every tile
     tile = Speckle(columns, rows, 1, 1, fill, spacing, seed).slide > 0
-    assert tile.sum() == round(fill * columns * rows)
+    assert tile.sum() == round(fill * rows * columns)
     for dy in range(-spacing, spacing + 1):
         for dx in range(-spacing, spacing + 1):
             if (dy, dx) != (0, 0):
