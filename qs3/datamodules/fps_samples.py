@@ -1,16 +1,15 @@
 """Which points of each stored cloud a net sees: farthest point sampling, done once, cached.
 
 The lineage samples in every access, from a random point. Here each cloud is sampled from a few
-points once, by several processes, and an epoch draws one of these samples for each cloud: it costs
-an index. Imports no torch, so that the processes need not.
+points once, by several threads, and an epoch draws one of these samples for each cloud: it costs an
+index.
 """
 
 import contextlib
 import hashlib
 import logging
 import os
-from functools import partial
-from importlib.metadata import version
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +18,13 @@ from jaxtyping import Float, Int
 from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
 from qs3.utils.files import atomic_path, locked, remove_leftovers
-from qs3.utils.pool import Processes
 from qs3.utils.processor import cores
 from qs3.utils.progress import shown
 from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
 
-_CHUNK = 64  # clouds that a process samples at a time
-WORTH_A_PROCESS = 2000  # samples; about 2 s of work
+_CHUNK = 64  # clouds that a thread samples at a time
 _VERSION = 2  # of the cache: raise it when the samples would be others
 _DIGEST = hashlib.sha256().digest_size
 
@@ -58,7 +55,7 @@ def farthest_points(
     if cache_dir is None:
         return sample_all(points, count, starts)
     cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
-    name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
+    name = f"{key} {count} of {stored}, v{_VERSION}"
     shape = (n, starts, count)
     order = read_array(cache, shape, name)
     if order is None:
@@ -106,19 +103,16 @@ def sample(
 def sample_all(
     points: Float[np.ndarray, "n p 3"], count: int, starts: int
 ) -> Int[np.ndarray, "n starts count"]:
-    """The same, with a progress bar on a terminal, and by several processes if it takes long."""
-    # fpsample holds the interpreter's lock, so threads would not help.
-    processes = min(len(cores()), len(points) * starts // WORTH_A_PROCESS, len(points))
+    """The same by several threads, with a progress bar on a terminal."""
     result = np.empty((len(points), starts, count), dtype=_index_type(points.shape[1]))
-    begins = range(0, len(points), _CHUNK)
-    chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
-    pool = Processes(processes if processes > 1 else 0)
-    outcomes = pool.run(partial(partial, sample, count=count, starts=starts), chunks)
-    for outcome in shown(outcomes, "sampling points", total=len(begins)):
-        if outcome.result is None:
-            raise ChildProcessError("a process died twice")
-        begin = int(outcome.name)
-        result[begin : begin + len(outcome.result)] = outcome.result
+    chunks = [slice(i, i + _CHUNK) for i in range(0, len(points), _CHUNK)]
+
+    def fill(chunk: slice) -> None:
+        result[chunk] = sample(np.asarray(points[chunk]), count, starts)
+
+    with ThreadPoolExecutor(len(cores())) as threads:
+        for _ in shown(threads.map(fill, chunks), "sampling points", total=len(chunks)):
+            pass
     return result
 
 

@@ -136,7 +136,7 @@ class CutDataset(Importer):
             "qs3": VERSION,
             "numpy": np.__version__,
             "opencv": cv2.__version__,
-            **{name: version(name) for name in ("scipy", "fpsample")},
+            "scipy": version("scipy"),
         }
         recipe, parts = {"settings": self.settings(), "versions": versions}, PartFiles(work)
         try:

@@ -210,7 +210,6 @@ class Plan:
                 "qs3": VERSION,
                 "numpy": version("numpy"),
                 "opencv": version("opencv-python-headless"),
-                "fpsample": version("fpsample"),
                 "machine": platform.machine(),
             },
         }

@@ -99,9 +99,9 @@ def farthest_point_sampling(
 ) -> Int[Tensor, "b m"]:
     """Order in which farthest point sampling takes the first `n` points, from `start`.
 
-    Exact; which of several equally far points comes first is unspecified (on the CPU fpsample
-    decides, elsewhere the lowest index). Indices are distinct, copies of taken points come last.
-    With n > N the order of all N points starts over.
+    Exact; which of several equally far points comes first is unspecified (elsewhere than on the
+    CPU the lowest index). Indices are distinct, copies of taken points come last. With n > N the
+    order of all N points starts over.
     """
     if not takes_numpy(x):
         b, total, _ = x.shape

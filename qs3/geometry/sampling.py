@@ -1,12 +1,9 @@
 """Points of clouds and surfaces: farthest point sampling, area sampling, the unit ball. Numpy."""
 
-import fpsample
 import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import DataError, MeshError
-
-_BUCKETS_FROM = 96  # points; below, fpsample's plain loop is faster
 
 
 def farthest_point_sampling_np(
@@ -18,6 +15,8 @@ def farthest_point_sampling_np(
     unspecified but always the same. Indices are distinct, copies of taken points come last. With
     n > N the order of all N points starts over.
     """
+    from qs3.geometry.farthest_points import farthest  # numba takes a moment to import
+
     points = np.asarray(points)
     total = len(points)
     assert 0 <= start < total, f"point {start} of {total}"
@@ -28,61 +27,13 @@ def farthest_point_sampling_np(
     if not np.isfinite(points).all():
         raise DataError("cannot sample points that are NaN or infinite")
     cloud = np.ascontiguousarray(points - points.mean(axis=0), dtype=np.float32)
-    order = _sample(cloud, n, start).astype(np.int64)
+    order = farthest(cloud, n, start)
     taken = np.zeros(total, dtype=bool)
     taken[order] = True
     distinct = np.count_nonzero(taken)
-    if distinct < n:  # at distance zero fpsample names one index again and again
+    if distinct < n:  # at distance zero one index comes again and again
         order[distinct:] = np.flatnonzero(~taken)[: n - distinct]
     return order
-
-
-def _sample(cloud: np.ndarray, n: int, start: int) -> np.ndarray:
-    """FPS of a float32 cloud from `start`: by buckets where they can be made to start there.
-
-    fpsample 0.3.3 looks up its start after it has sorted the points into the tree, so it starts
-    with whichever point came to lie at that position. We follow `start` through the sorting and
-    pass the position where it ends; should another version do otherwise, the plain loop takes over.
-    """
-    if len(cloud) >= _BUCKETS_FROM and n > 16:
-        height = 3 if len(cloud) <= 4096 else 5
-        position = _position_in_tree(cloud, height, start)
-        order = fpsample.bucket_fps_kdline_sampling(cloud, n, h=height, start_idx=position)
-        if order[0] == start:
-            return order
-    return fpsample.fps_sampling(cloud, n, start_idx=start)
-
-
-def _position_in_tree(cloud: np.ndarray, height: int, start: int) -> int:
-    """Where fpsample's tree of buckets puts point `start`.
-
-    Each level halves the part at the mean of its widest dimension by Hoare's partition: the i-th
-    large value from the left changes places with the i-th small one from the right.
-    """
-    position, offset = start, 0
-    axes = np.ascontiguousarray(cloud.T)
-    for _ in range(height):
-        count = axes.shape[1]
-        if count == 1:
-            break
-        values = axes[np.argmax(np.ptp(axes, axis=1))]
-        mean = np.cumsum(values, dtype=np.float32)[-1] / np.float32(count)  # added in order
-        small = values < mean
-        split = np.count_nonzero(small)
-        left = np.flatnonzero(~small[:split])
-        right = split + np.flatnonzero(small[split:])[::-1]
-        if position < split and not small[position]:
-            position = right[np.searchsorted(left, position)]
-        elif position >= split and small[position]:
-            position = left[len(right) - 1 - np.searchsorted(right[::-1], position)]
-        swapped = axes.copy()
-        swapped[:, left], swapped[:, right] = axes[:, right], axes[:, left]
-        split = min(max(split, 1), count - 1)
-        if position < split:
-            axes = swapped[:, :split]
-        else:
-            axes, position, offset = swapped[:, split:], position - split, offset + split
-    return int(offset + position)
 
 
 def unit_ball(points: Float[np.ndarray, "*b points 3"]) -> Float[np.ndarray, "*b points 3"]:

@@ -66,7 +66,7 @@ def keep_freed_memory() -> bool:
     return all([bool(mallopt(key, value)) for key, value in settings])
 
 
-def compiled(kernel: Callable[..., None]) -> Any:
+def compiled(kernel: Callable[..., Any]) -> Any:
     """`kernel`, compiled at the first call for each type.
 
     What was compiled is kept next to the kernel's file, or in the user's cache.

@@ -1,3 +1,4 @@
+import hashlib
 import subprocess
 import sys
 from itertools import pairwise
@@ -47,6 +48,17 @@ def test_fps_with_ties_and_copies(total: int) -> None:
         assert order[0] == start
         assert len(set(order.tolist())) == n
         assert_farthest(points, order)
+
+
+@pytest.mark.parametrize(
+    ("total", "digest"),
+    [(50, "9df063848922e323"), (400, "6f3a0344953559d3"), (6000, "e57023413631a9c0")],
+)
+def test_ties_are_fpsamples(total: int, digest: str) -> None:
+    """Recorded with fpsample 0.3.3: by its plain loop, and by 2^3 and 2^5 buckets."""
+    points = np.random.default_rng(total).integers(0, 8, (total, 3)).astype(float)
+    orders = [farthest_point_sampling_np(points, min(total, 600), k) for k in (0, 7, total - 1)]
+    assert hashlib.sha256(np.concatenate(orders).astype("<i8").data).hexdigest()[:16] == digest
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
