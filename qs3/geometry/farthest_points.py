@@ -5,7 +5,7 @@ the same farthest point as before, so its other points wait until it does (Han e
 IEEE TCAD 2023). Of equally far points the first in the order of the tree's first levels is taken:
 2^3 buckets, 2^5 of more than 4,096 points, each halved at the mean of its longest side, or, below
 96 points or up to 16 samples, the last of all. It is the order of fpsample 0.3.3, which chose the
-points of the datasets that were published.
+points of earlier datasets.
 """
 
 import numpy as np
