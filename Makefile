@@ -1,7 +1,12 @@
 # qs3: make quickstart, make test. `make help` lists the rest.
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON ?= python3
 VENV   ?= .venv
 RUN    := $(VENV)/bin/python
+# The tested versions; of 3.12 as of 3.13.
+PINS   := constraints/$(shell $(PYTHON) -c 'import sys; print("3.11" if sys.version_info < (3, 12) else "3.13")').txt
+EXTRAS ?= dev
+# Of `make test-python`.
+PY     ?= python3.13
 OUT    ?= out/quickstart
 # Extra arguments for pip, e.g. an index that has CPU builds of torch.
 PIP_ARGS ?=
@@ -13,19 +18,16 @@ THREADS ?=
 POINTS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor quickstart lint format test test-all test-triton bench docs clean
+.PHONY: help install doctor quickstart lint format test test-all test-python test-triton bench docs clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
 
 install: $(VENV)/installed ## the environment in .venv, pinned
 
-$(VENV)/installed: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' \
-	  || { echo "qs3 needs Python 3.11 (bpy has wheels for no other). Call: make PYTHON=/path/to/python3.11"; exit 1; }
-	@$(PYTHON) -m venv $(VENV) \
-	  || { echo "The venv module is missing. On Debian and Ubuntu: apt-get install python3.11-venv"; exit 1; }
-	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c constraints.txt -e '.[dev]'
+$(VENV)/installed: pyproject.toml $(PINS)
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c $(PINS) -e '.[$(EXTRAS)]'
 	@touch $@
 	@$(RUN) -m qs3 doctor
 
@@ -51,6 +53,12 @@ test test-all: export PYTHONDONTWRITEBYTECODE =
 
 test: install ## all tests that are not slow, on 2 cores
 	$(RUN) -m pytest $(PARALLEL) --ignore=tests/benchmarks
+
+test-python: ## another Python, PY=python3.13, in an environment of its own: install, scan, train, predict
+	rm -rf out/venv-$(notdir $(PY))
+	$(MAKE) install PYTHON=$(PY) VENV=out/venv-$(notdir $(PY)) EXTRAS=blender
+	.ci/smoke out/venv-$(notdir $(PY))/bin
+	rm -rf out/venv-$(notdir $(PY))
 
 test-triton: install ## kernels for GPUs in Triton's interpreter, which is fetched for it (286 MB)
 	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) --no-deps --target out/triton triton==3.9.0
