@@ -2,6 +2,7 @@
 
 import gc
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,10 @@ if os.environ.get("QS3_CHECK_SHAPES"):  # `make test-all`
 
 @pytest.hookimpl(tryfirst=True)  # before pytest leaves out what is marked
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give slow tests the time that a busy machine takes."""
+    """Give slow tests the time that a busy machine takes; leave out Blender where it is not."""
     for item in items:
+        if item.get_closest_marker("blender") and find_spec("bpy") is None:
+            item.add_marker(pytest.mark.skip(reason="there is no bpy for this Python"))
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(_SLOW_S))
 

@@ -7,6 +7,7 @@ LLVM, a missing X library) may end the process.
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from typing import Annotated, NamedTuple
 
 
@@ -19,13 +20,14 @@ class Check(NamedTuple):
     packages: str = ""
 
 
+BLENDER = Check(
+    "Blender (bpy)",
+    "import bpy; print(bpy.app.version_string)",
+    "renderer=blender does not work; renderer=mitsuba does",
+    "libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libgl1 libegl1",
+)
 CHECKS = (
-    Check(
-        "Blender (bpy)",
-        "import bpy; print(bpy.app.version_string)",
-        "renderer=blender does not work; renderer=mitsuba does",
-        "libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libgl1 libegl1",
-    ),
+    *([BLENDER] if find_spec("bpy") else []),
     Check(
         "Mitsuba, fast variant",
         "from qs3.sensors.renderers.llvm import find_variant\n"
@@ -40,6 +42,7 @@ CHECKS = (
 
 def doctor(*, install: Annotated[bool, "install missing Debian packages, as root"] = False) -> None:
     """What works on this machine, and which system package would help."""
+    renderers = ["Mitsuba"]
     for check in CHECKS:
         works, text = run(check)
         if not works and check.packages and install and (apt := shutil.which("apt-get")):
@@ -52,6 +55,10 @@ def doctor(*, install: Annotated[bool, "install missing Debian packages, as root
             print(f"    without it: {check.without}")
             if check.packages:
                 print(f"    to fix it: apt-get install {check.packages}")
+        elif check is BLENDER:
+            renderers.append("Blender")
+    elsewhere = "; Blender of another interpreter: renderer=blender renderer.python=PATH"
+    print(f"  renderers: {', '.join(renderers)}{elsewhere * (len(renderers) == 1)}")
 
 
 def run(check: Check) -> tuple[bool, str]:

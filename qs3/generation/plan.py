@@ -52,7 +52,7 @@ MAKES_CLOUDS = (
 
 _ADDED = "catalogue-"  # before the names of objects that fill up the user's
 _OTHER_HALF = 1000
-_NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
+_NOT_DECISIVE = ("threads", "python")  # of a renderer: its versions are written down apart
 # Keys of a config that name places, or that never change a byte.
 _UNSTORED = ("paths", "workers", "engine", "force", "strict")
 _OF_LOOKING = ("sensor", "views", "provenance", "keep_views", "poses")

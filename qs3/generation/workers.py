@@ -34,7 +34,7 @@ COLLIDERS = "colliders left out"
 """Begins the note of an object that had some."""
 DIED = "the worker process died on this object each time (out of memory, or a crash)"
 _DEATHS = 3  # objects in a row
-_LIBRARIES = ("numpy", "opencv-python-headless", "mitsuba", "drjit", "bpy", "trimesh")
+_LIBRARIES = ("numpy", "opencv-python-headless", "mitsuba", "drjit", "trimesh")
 
 
 @dataclass(frozen=True, eq=False)

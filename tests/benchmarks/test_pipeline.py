@@ -95,9 +95,13 @@ PAIRS: dict[str, Callable[[], Pair]] = {
     "Mitsuba, a pair": of_renderers,
     "predict, a cloud": of_prediction,
 }
+NEED_BLENDER = ("Blender, a window", "Mitsuba, a pair")
 
 
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.blender] * (n in NEED_BLENDER)) for n in PAIRS],
+)
 def test_pair(name: str, benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
     compare(name, PAIRS[name](), benchmark, capsys)
 

@@ -12,7 +12,7 @@ from qs3.sensors.matching import CensusMatcher, ReferenceMatcher, StereoBlockMat
 from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Speckle
-from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.blender_process import blender
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 
 SPLIT = InfraredCamera(speckle_contrast=0.2, ambient_speckles=False)
@@ -38,7 +38,7 @@ WRONG = [
     (CensusMatcher, {"small_step": 50.0}),
     (CensusMatcher, {"block_px": 31}),  # its costs exceed 16 bits
     (InfraredCamera, {"metering": "centre"}),
-    (BlenderRenderer, {"samples": 0}),
+    (blender, {"samples": 0}),
     (MitsubaRenderer, {"samples": 0}),
 ]
 

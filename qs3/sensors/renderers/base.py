@@ -5,15 +5,13 @@ from __future__ import annotations
 import ctypes
 import sys
 from dataclasses import dataclass
-from typing import Annotated, Protocol
+from typing import Protocol
 
 import numpy as np
-from annotated_types import Ge
 
 from qs3.geometry.cameras import Camera
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.gloss import Gloss
-from qs3.utils.settings import Count, settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +158,7 @@ class Renderer(Protocol):
         """Renderer, variant and library versions: what decides the bytes it makes."""
 
 
-@settings
+@dataclass(frozen=True)
 class RendererSettings:
     """Settings both renderers share.
 
@@ -170,8 +168,8 @@ class RendererSettings:
         threads: 0 is all cores. Output must not depend on it.
     """
 
-    samples: Count = 16
-    threads: Annotated[int, Ge(0)] = 1
+    samples: int = 16
+    threads: int = 1
 
 
 def give_memory_back() -> None:

@@ -1,7 +1,9 @@
 """Blender's Cycles, on the CPU or a GPU: the renderer of the paper, our reference.
 
 The only place that imports bpy. One process holds one Blender with global state; every call
-builds its own data, renders, and removes it, so nothing is left for the next call.
+builds its own data, renders, and removes it, so nothing is left for the next call. What this
+module imports is the standard library, numpy and modules of ours that need no more: it also runs
+in interpreters that have nothing but Blender (`blender_process`).
 """
 
 import os
@@ -10,6 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,7 @@ from qs3.sensors.renderers.blender_scene import (
     cast_shadow_by_copy,
     show_camera_only,
 )
+from qs3.utils.pool import portable
 
 _BACKENDS = ("OPTIX", "CUDA")  # OptiX needs a newer driver and is faster
 _BACKGROUND_M = 1e9  # Cycles writes 1e10 m where nothing is hit
@@ -53,17 +57,8 @@ class Device:
 class BlenderRenderer:
     """A `Renderer` on Blender's Cycles."""
 
-    def __init__(
-        self, samples: int = 16, threads: int = 1, device: str = "auto", name: str = "blender"
-    ) -> None:
-        """Start Blender inside this process.
-
-        Args:
-            samples, threads: see `RendererSettings`.
-            device: "auto" (a GPU if Blender lists one for OptiX or CUDA, else the CPU), "cpu"
-                or "gpu". The two make different bytes, so a dataset's recipe says which it was.
-            name: what the configuration calls it; taken so that its node can be instantiated.
-        """
+    def __init__(self, samples: int = 16, threads: int = 1, device: str = "auto") -> None:
+        """Start Blender inside this process; see `blender_process.blender`."""
         self.settings = RendererSettings(samples, threads)
         with _one_cpu() if threads == 1 else nullcontext():
             self._bpy = _import_bpy()
@@ -159,9 +154,26 @@ class BlenderRenderer:
         return images
 
 
+def serve(descriptor: int) -> None:
+    """Render for the process at the other end of a pipe, until it closes that end."""
+    pipe, renderer = Connection(descriptor), None
+    with suppress(EOFError):
+        while True:
+            answer: Any
+            question = pipe.recv()
+            try:
+                if renderer is None:
+                    renderer = BlenderRenderer(**question)
+                    answer = renderer.provenance()
+                else:
+                    answer = renderer.render(**question)
+            except Exception as error:
+                answer = portable(error)
+            pipe.send(answer)
+
+
 def choose(wanted: str, listed: dict[str, list[str]]) -> Device:
     """The device for "auto", "cpu" or "gpu"; `listed` are names of GPUs by backend."""
-    assert wanted in ("auto", "cpu", "gpu"), "renderer.device must be auto, cpu or gpu"
     for backend in _BACKENDS:
         if wanted != "cpu" and listed.get(backend):
             # One is used: rendering on several splits the image, and worker processes share one.
@@ -205,8 +217,8 @@ def _import_bpy() -> Any:
         import bpy
     except ImportError as error:
         raise RenderError(
-            f"Blender cannot be loaded ({error}): pip install 'bpy>=4.5,<4.6', and on Debian apt "
-            "install libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libgl1 libegl1"
+            f"Blender cannot be loaded ({error}): qs3 doctor says what it needs; renderer.python=PATH "
+            "takes another interpreter's, and renderer=mitsuba renders the same"
         ) from error
     return bpy
 
@@ -282,6 +294,7 @@ def _configure(target: Any, settings: RendererSettings) -> None:
     output = render.image_settings
     if hasattr(output, "media_type"):  # Blender 5 asks for it first
         output.media_type = "MULTI_LAYER_IMAGE"
+        output.use_exr_interleave = True  # one part, as in Blender 4
     output.file_format = "OPEN_EXR_MULTILAYER"
     output.color_depth = "32"
     output.exr_codec = "NONE"
@@ -312,7 +325,8 @@ def _image(channels: dict[str, np.ndarray], camera: Camera) -> Image:
     named = {name.split(".", 1)[1]: value for name, value in channels.items() if "." in name}
     radiance = np.ascontiguousarray(named["Combined.R"])
     assert radiance.shape == (camera.rendered.height, camera.rendered.width)
-    depth, label = named.get("Depth.Z"), named.get("IndexOB.X")
+    depth = named.get("Depth.Z")
+    label = named.get("IndexOB.X", named.get("Object Index.X"))  # of Blender 4 and 5
     if depth is None or label is None:
         return Image.without_geometry(radiance)
     depth = np.where(depth < _BACKGROUND_M, depth, np.float32(np.inf))

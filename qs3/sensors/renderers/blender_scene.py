@@ -75,7 +75,7 @@ def cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> Any:
 def _surface(bpy: Any, body: Body, ambient: float) -> Any:
     """The material of a body: matt or glossy, with what ambient light adds as its own glow."""
     material = bpy.data.materials.new("diffuse")
-    material.use_nodes = True
+    _use_nodes(material)
     material.cycles.emission_sampling = "NONE"  # the ambient term lights nothing else
     tree = material.node_tree
     tree.nodes.clear()
@@ -139,7 +139,7 @@ def add_projector(bpy: Any, target: Any, projector: Projector) -> Any:
     light.spot_blend = 0.0
     # The cone only has to hold the slide; the slide's edge is the texture's.
     light.spot_size = min(2 * math.atan(math.hypot(tan_x, tan_y)) + 0.1, math.radians(179.0))
-    light.use_nodes = True
+    _use_nodes(light)
     tree = light.node_tree
     tree.nodes.clear()
     node, link = tree.nodes.new, tree.links.new
@@ -192,6 +192,11 @@ def add_area(bpy: Any, target: Any, area: AreaLight) -> None:
 def blender_pose(world_from_local: np.ndarray) -> Any:
     """Pose of a camera or light in Blender: they look along -z with y up."""
     return _matrix(np.asarray(world_from_local) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
+def _use_nodes(block: Any) -> None:
+    if block.node_tree is None:  # Blender 5 makes one by itself, and warns
+        block.use_nodes = True
 
 
 def _matrix(matrix: np.ndarray) -> Any:

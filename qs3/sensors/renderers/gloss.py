@@ -14,31 +14,29 @@ albedo) (1 - o . h)^5 (Schlick). Light is not passed on from facet to facet.
 """
 
 import functools
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
-from annotated_types import Interval
-
-from qs3.utils.settings import Share, settings
 
 COSINES = 33
 """Entries of `kept_back`, at cosines 0 to 1."""
 _FACETS = 24  # squared: facets that a mean is taken over
 
 
-@settings
+@dataclass(frozen=True)
 class Gloss:
     """How a surface shines, beside its albedo; the defaults are those of Blender's Principled BSDF.
 
     Attributes:
-        roughness: 1 is nearly matt; below 0.1 a point light's reflex is smaller than a pixel.
-        specular: of a dielectric, reflectance at normal incidence over 0.08; 0.5 is glass or
+        roughness: 0.1..1, which is nearly matt; below 0.1 a point light's reflex is smaller than
+            a pixel.
+        specular: 0..1, of a dielectric, reflectance at normal incidence over 0.08; 0.5 is glass or
             plastic (refractive index 1.5), 0 leaves the Lambertian part alone.
         metal: the albedo is the reflectance at normal incidence, nothing is scattered below.
     """
 
-    roughness: Annotated[float, Interval(ge=0.1, le=1)] = 0.5
-    specular: Share = 0.5
+    roughness: float = 0.5
+    specular: float = 0.5
     metal: bool = False
 
     @property

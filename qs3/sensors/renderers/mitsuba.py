@@ -9,9 +9,10 @@ and its `projector` emitter do the same there.
 
 import os
 from importlib.metadata import version
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge
 
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera, Intrinsics
@@ -28,13 +29,19 @@ from qs3.sensors.renderers.base import (
 from qs3.sensors.renderers.mitsuba_glossy import GlossyScene
 from qs3.sensors.renderers.mitsuba_jit import JitScene
 from qs3.sensors.renderers.mitsuba_scalar import ScalarScene
+from qs3.utils.settings import Count, checked
 
 
 class MitsubaRenderer:
     """A `Renderer` on Mitsuba 3."""
 
+    @checked
     def __init__(
-        self, samples: int = 16, threads: int = 1, variant: str = "auto", name: str = "mitsuba"
+        self,
+        samples: Count = 16,
+        threads: Annotated[int, Ge(0)] = 1,
+        variant: str = "auto",
+        name: str = "mitsuba",
     ) -> None:
         """Find a variant that works here and load it.
 

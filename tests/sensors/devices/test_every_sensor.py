@@ -88,6 +88,7 @@ def test_the_projectors_shadow_is_as_wide_as_geometry_says(name, source_m, slack
         assert not frame.images["lit"][frame.reason == Reason.SHADOW].any()
 
 
+@pytest.mark.blender
 @pytest.mark.parametrize(
     ("sensor", "tolerance_m"),
     [

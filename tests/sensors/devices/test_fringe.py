@@ -44,7 +44,9 @@ def test_noise_and_bias_follow_the_stated_law(renderer, white_level):
     assert np.log(measured[2] / measured[0]) / np.log(2.5 / 0.8) == pytest.approx(2.1, abs=0.2)
 
 
-@pytest.mark.parametrize("make", [MitsubaRenderer, BlenderRenderer])
+@pytest.mark.parametrize(
+    "make", [MitsubaRenderer, pytest.param(BlenderRenderer, marks=pytest.mark.blender)]
+)
 def test_where_a_renderer_looks_does_not_depend_on_the_scene(make):
     """The twin: another plane, further away and larger, and another slide on it."""
     camera = Camera(Intrinsics.centred(64, 48, 60.0), POSE, Window(20, 10, 16, 12))

@@ -28,6 +28,7 @@ image.save_render(sys.argv[2], scene=scene)
 """
 
 
+@pytest.mark.blender
 def test_the_curve_is_blenders(tmp_path):
     """At values between those of the table."""
     cv2 = pytest.importorskip("cv2")

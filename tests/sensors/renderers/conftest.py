@@ -8,7 +8,11 @@ from tests.sensors.renderers.scenes import RENDERERS
 
 @pytest.fixture(
     scope="session",
-    params=["blender", "mitsuba", pytest.param("mitsuba_scalar", marks=pytest.mark.slow)],
+    params=[
+        pytest.param("blender", marks=pytest.mark.blender),
+        "mitsuba",
+        pytest.param("mitsuba_scalar", marks=pytest.mark.slow),
+    ],
 )
 def shared(request):
     return RENDERERS[request.param]()

@@ -21,6 +21,7 @@ def disparity_px(left, right):
     return np.where(found > 0, found, np.nan)
 
 
+@pytest.mark.blender
 def test_radiance_geometry_and_disparity_agree():
     """On a box; solids and furniture are compared as the paper's sensor."""
     solid = trimesh.creation.box((0.3, 0.28, 0.35))

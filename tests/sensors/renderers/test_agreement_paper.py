@@ -28,6 +28,7 @@ from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 SENSOR = SpeckleStereo()
 PX_M = SENSOR.focal_px * SENSOR.baseline_m
 # 20 px is 7.5 m and 67 px is 2.2 m.
+pytestmark = pytest.mark.blender
 MATCHER = ReferenceMatcher(min_disparity=20, num_disparities=48, steps_per_px=0)
 NO_NOISE = InfraredCamera(electrons_at_white=1e9, read_noise_e=0)
 FURNITURE = ("chair", "plant", "bathtub", "monitor", "lamp", "bookshelf")

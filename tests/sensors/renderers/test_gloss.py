@@ -174,6 +174,7 @@ def test_the_variant_without_a_compiler_refuses_what_it_cannot_render():
 
 
 @pytest.mark.slow
+@pytest.mark.blender
 @pytest.mark.parametrize("gloss", [None, *GLOSSES])
 def test_blender_s_principled_bsdf_is_the_same_surface(gloss, mitsuba):
     """Another implementation of the same model: radiance of a plane and of a body with corners."""
