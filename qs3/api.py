@@ -1,7 +1,7 @@
 """Training and generation as functions, for notebooks: the words are those of the command line.
 
 qs3.generate("domain=modelnet10", "limit=5", "paths.data_dir=data")
-scan = qs3.generate(trimesh.load("chair.glb"), "domain=specklenet10", "renderer=mitsuba")
+scan = qs3.generate(trimesh.load("chair.glb"), "domain=specklenet10")
 folder = qs3.train("experiment=quickstart", "seed=1", "paths.data_dir=data")
 predictor = qs3.load(folder)
 """

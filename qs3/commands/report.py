@@ -256,7 +256,7 @@ def pipeline(
     mesh: Annotated[Path | None, "a mesh file to scan in place of the domain's objects"] = None,
     view: Annotated[int, "whose images are shown"] = 0,
     out: Annotated[Path, "the picture"] = Path("pipeline.png"),
-    **overrides: Annotated[str, "of generate.py, such as renderer=mitsuba sensor=kinect_v1"],
+    **overrides: Annotated[str, "of generate.py, such as sensor=kinect_v1"],
 ) -> None:
     """Draw one object from images to residuals.
 

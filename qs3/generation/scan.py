@@ -67,7 +67,7 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
 
     Args:
         solids: by id.
-        overrides: of generate.py, such as ["domain=specklenet10", "renderer=mitsuba"].
+        overrides: of generate.py, such as ["domain=specklenet10"].
     """
     from qs3.config.compose import composed
 

@@ -97,7 +97,7 @@ def scan_object(
     """Run one object through a domain's recipe.
 
     Args:
-        overrides: of generate.py, such as ["domain=specklenet10", "renderer=mitsuba"].
+        overrides: of generate.py, such as ["domain=specklenet10"].
         object_id: which object; None: a chair, or the first there is.
         mesh: a mesh file to scan in place of the domain's objects.
     """

@@ -9,7 +9,6 @@ from tests.composing import compose
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = [
     "sensor=speckle_stereo_small",
-    "renderer=mitsuba",
     "renderer.samples=2",
     "views=2",
     "classes=[chair,table,lamp]",

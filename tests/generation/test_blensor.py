@@ -29,7 +29,7 @@ def made(tmp_path_factory):
     found = {}
     for key, domain in (("S", "specklenet10"), ("B", "blensor10")):
         data_dir = tmp_path_factory.mktemp(key)
-        quick = ["renderer=mitsuba", "renderer.samples=2", "views=2", "workers=0", "limit=1"]
+        quick = ["renderer.samples=2", "views=2", "workers=0", "limit=1"]
         where = ["classes=[chair,table]", "splits=[test]", f"paths.data_dir={data_dir}"]
         found[key] = (generate(config(domain, *quick, *where)), data_dir / domain)
     return found

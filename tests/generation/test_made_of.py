@@ -91,7 +91,7 @@ def test_a_preset_beside_conf_has_the_name_of_its_file(tmp_path):
     target = "_target_: qs3.sensors.devices.fitted.FittedDepth\n"
     (tmp_path / "sensor" / "my_camera.yaml").write_text(target + "noise_power: 2\n")
     words = ["domain=specklenet10", f"hydra.searchpath=[file://{tmp_path}]", "sensor=my_camera"]
-    words += ["renderer=mitsuba", "classes=[chair]", "splits=[test]", "limit=1", *FAST]
+    words += ["classes=[chair]", "splits=[test]", "limit=1", *FAST]
     words += [f"paths.data_dir={tmp_path}", "sensor.noise_power=1"]
     words.remove("sensor=speckle_stereo_small")
     made = qs3.generate(*words).made_of

@@ -170,7 +170,7 @@ def test_generate_follows_the_poses_and_records_what_has_none(poses, tmp_path):
         sofa().to_trimesh().export(meshes.parent / f"{name}.off", digits=9)
     overrides = [
         *("domain=specklenet10", f"meshes={tmp_path / 'meshes'}", "classes=[sofa]"),
-        *(f"poses={poses}", "renderer=mitsuba", "renderer.samples=1", "views=1", "workers=0"),
+        *(f"poses={poses}", "renderer.samples=1", "views=1", "workers=0"),
         *("recipe.points=256", f"paths.data_dir={tmp_path / 'data'}"),
     ]
     cfg, without = config(*overrides), config(*overrides[:3], *overrides[4:])

@@ -11,7 +11,7 @@ from qs3.report.pipeline import pipeline_figure, scan_object
 from tests.report.made_runs import not_blank
 from tests.running import main
 
-SMALL = ["renderer=mitsuba", "renderer.samples=2", "views=2"]
+SMALL = ["renderer.samples=2", "views=2"]
 
 
 @pytest.fixture(scope="module")
