@@ -217,8 +217,8 @@ def _import_bpy() -> Any:
         import bpy
     except ImportError as error:
         raise RenderError(
-            f"Blender cannot be loaded ({error}): qs3 doctor says what it needs; renderer.python=PATH "
-            "takes another interpreter's, and renderer=mitsuba renders the same"
+            f"Blender cannot be loaded ({error}); see `qs3 doctor`. renderer.python=PATH takes "
+            "another interpreter's, and renderer=mitsuba renders the same"
         ) from error
     return bpy
 
