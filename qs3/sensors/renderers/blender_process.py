@@ -89,9 +89,7 @@ class _Elsewhere:
             command = [str(self._python), "-I", "-c", code]
         try:
             with theirs:
-                self._process = subprocess.Popen(
-                    command, pass_fds=[theirs.fileno()], stdout=2
-                )
+                self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdout=2)
             weakref.finalize(self, _stop, self._pipe, self._process)
             self._provenance: dict[str, str] = self._ask(self._settings)
         except (EOFError, OSError) as error:
