@@ -21,6 +21,7 @@ from annotated_types import Ge, Gt
 from jaxtyping import Bool, Float, Int
 
 from qs3.datasets.depth_images import DepthImage
+from qs3.datasets.picture_kernels import connected, mean_distance
 from qs3.utils.settings import Count, NotNegative, settings
 
 CLEAN, HARD = "clean", "hard"
@@ -32,6 +33,7 @@ _FLOOR_LEAST = 200  # points
 _PLATE = 0.9  # share of the points that must lie in a plate for the object to be flat
 _LEAST_PX = 20  # a piece below is dust: it is joined to nothing
 _MOST_PIECES = 40  # looked at, the largest first
+_REACH_PX = 4  # a pixel's nearest points are among those of the 80 around it
 _SAMPLE = 2000  # points of a piece that the gap to others is measured with
 _FAR = 1e9
 
@@ -116,7 +118,8 @@ class Piece:
 
     Attributes:
         points_m: [n, 3] float32, z up, the camera at the origin; row by row in the picture.
-        inlier: [n] whether a point is near its neighbours; see `Rules.outlier_sds`.
+        inlier: [n] whether a point is near its neighbours, see `Rules.outlier_sds`; all, where few
+            pixels, the rim or what covers it refuse the piece.
         pixels: with depth, that are the object's.
         holes: share of the mask without depth.
         kept: share of the measured pixels that are the object's; the others lie behind or before.
@@ -188,9 +191,14 @@ def cut(
     depth there are no points.
     """
     mask = mask & image.inside
-    own, measured, core = own_pixels(image, mask, rules, edge_px)
-    points = image.points_m[own]
-    inlier, pixels, taken = _inliers(points, rules), len(points), own
+    measured, core = measured_pixels(image, mask, rules, edge_px)
+    own = body(pieces(measured, image.depth_m, rules), image.points_m, rules)
+    points, taken = image.points_m[own], own
+    pixels, inlier = len(points), np.ones(len(points), dtype=bool)
+    cut_off, covered = rim(mask, image.inside, rules), occlusion(mask, own, image.depth_m, rules)
+    usable = pixels >= rules.limits_of(cls).pixels
+    if usable and cut_off <= rules.most_rim and covered <= rules.most_occ:
+        inlier = _inliers(image.points_m, own, rules)  # costs most
     if rules.drop_outliers:
         taken = own.copy()
         taken[own] = inlier
@@ -202,22 +210,21 @@ def cut(
         piece = replace(
             piece,
             kept=pixels / int(measured.sum()),
-            rim=rim(mask, image.inside, rules),
-            occ=occlusion(mask, own, image.depth_m, rules),
+            rim=cut_off,
+            occ=covered,
             extent_m=(x, y, z),
             depth_m=float(np.median(image.depth_m[own])),
         )
     return replace(piece, faults=tuple(faults(piece, cls, rules)))
 
 
-def own_pixels(
+def measured_pixels(
     image: DepthImage, mask: Bool[np.ndarray, "h w"], rules: Rules, edge_px: int | None = None
-) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """The pixels that `cut` takes; those of the mask's core with depth; those of its core."""
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """The pixels of the mask's core with depth in range; those of its core."""
     edge_px = rules.erode_px if edge_px is None else edge_px
     core = _least((mask & image.inside).astype(np.uint8), edge_px, 1) > 0
-    measured = core & (image.depth_m >= rules.near_m) & (image.depth_m <= rules.far_m)
-    return body(pieces(measured, image.depth_m, rules), image.points_m, rules), measured, core
+    return core & (image.depth_m >= rules.near_m) & (image.depth_m <= rules.far_m), core
 
 
 def faults(piece: Piece, cls: str, rules: Rules) -> list[Fault]:
@@ -267,26 +274,11 @@ def pieces(
     Pixels next to each other in a row or column are of one piece unless their depth jumps; so are
     the two ends of a hole of at most `rules.bridge_px`.
     """
-    count = int(measured.sum())
-    number = np.full(measured.shape, -1, dtype=np.int64)
-    if count == 0:
-        return number
-    number[measured] = np.arange(count)
-    edges = []
-    for pixels, depth in ((number, depth_m), (number.T, depth_m.T)):
-        row, column = np.nonzero(pixels >= 0)  # along rows, from left to right
-        z = depth[row, column]
-        gap = column[1:] - column[:-1]
-        jump = np.abs(z[1:] - z[:-1])
-        allowed = np.maximum(rules.jump_m, rules.jump_share * np.minimum(z[1:], z[:-1]))
-        near = (row[1:] == row[:-1]) & (gap <= rules.bridge_px + 1) & (jump <= allowed)
-        index = pixels[row, column]
-        edges.append(np.stack([index[1:][near], index[:-1][near]]))
-    a, b = np.concatenate(edges, axis=1)
-    graph = scipy.sparse.coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
-    _, piece = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    order = np.argsort(-np.bincount(piece), kind="stable")
-    number[measured] = np.argsort(order)[piece]
+    number = connected(depth_m, measured, rules.jump_m, rules.jump_share, rules.bridge_px)
+    piece = number[measured]
+    if len(piece):
+        order = np.argsort(-np.bincount(piece), kind="stable")
+        number[measured] = np.argsort(order)[piece]
     return number
 
 
@@ -358,12 +350,13 @@ def occlusion(
     return float((nearest < object_depth - jump).mean())
 
 
-def _inliers(points_m: Float[np.ndarray, "n 3"], rules: Rules) -> Bool[np.ndarray, " n"]:
-    if len(points_m) <= rules.neighbours:
-        return np.ones(len(points_m), dtype=bool)
-    distance, _ = scipy.spatial.cKDTree(points_m).query(points_m, k=rules.neighbours + 1)
-    mean = distance[:, 1:].mean(axis=1)
-    near: Bool[np.ndarray, " n"] = mean <= mean.mean() + rules.outlier_sds * mean.std()
+def _inliers(
+    points_m: Float[np.ndarray, "h w 3"], own: Bool[np.ndarray, "h w"], rules: Rules
+) -> Bool[np.ndarray, " n"]:
+    mean = mean_distance(points_m, own, rules.neighbours, _REACH_PX)[own]
+    alone = np.isinf(mean)
+    least = mean[~alone]
+    near: Bool[np.ndarray, " n"] = mean <= least.mean() + rules.outlier_sds * least.std()
     return near
 
 

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,6 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.kept import OBJECTS, PROVENANCE, clouds_picture
 from qs3.generation.made_of import made_of
 from qs3.generation.plan import Plan, code_fingerprint, planned
-from qs3.generation.recipes import Cloud
 from qs3.generation.workers import (
     COLLIDERS,
     Job,
@@ -36,7 +35,7 @@ from qs3.generation.workers import (
 )
 from qs3.meshes.mesh import MeshItem
 from qs3.meshes.placement import RealSize
-from qs3.store.meta import MANIFEST, ManifestRow, is_finished
+from qs3.store.meta import MANIFEST, OK, ManifestRow, is_finished
 from qs3.store.parts import (
     CLOUDS,
     CONFIG,
@@ -67,7 +66,7 @@ def generate(cfg: DictConfig) -> PointSet:
         The dataset.
     """
     plan = planned(cfg)
-    domain, folder, items = plan.domain, plan.domain.folder, plan.items
+    domain, folder, tasks = plan.domain, plan.domain.folder, plan.tasks
     _check_place(domain, plan.options.force)
     pool: Pool = build(cfg.engine)
     parts = PartFiles(folder)
@@ -91,19 +90,20 @@ def generate(cfg: DictConfig) -> PointSet:
             _judge_failed(plan, pointset)
             return pointset
         start = time.perf_counter()
-        _warn_of_sizes(plan.recipe, items)
+        _warn_of_sizes(plan.recipe, plan.items)
         _begin(parts, recipe)
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
             job = replace(job, expected={**software(), **renderer}, check_place=place)
-        passing = _scan_missing(job, items, parts, pool, domain.label)
-        outcomes = _collect(items, parts, passing, folder)
+        passing = _scan_missing(job, tasks, parts, pool, domain.label)
+        outcomes = _collect(tasks, parts, passing, folder)
+        made = _made(plan, outcomes)
         # The dataset last: with meta.yaml it counts as finished, and the parts can go.
-        _draw(domain, items, outcomes)
+        _draw(domain, made)
         write_text(folder / CONFIG, OmegaConf.to_yaml(cfg, resolve=True))
-        pointset = _write(plan, outcomes, recipe)
+        pointset = _write(plan, made, recipe)
         parts.clear()
-    _report(pointset, items, outcomes, time.perf_counter() - start)
+    _report(pointset, made, outcomes, time.perf_counter() - start)
     _judge_failed(plan, pointset)
     return pointset
 
@@ -121,8 +121,8 @@ def _check_place(domain: Domain, force: bool) -> None:
 
 def _judge_failed(plan: Plan, pointset: PointSet) -> None:
     """Warn of the objects that a dataset lacks; with strict=true they are an error."""
-    failed = len(plan.items) - len(pointset.ids)
-    problem = f"{failed} of {len(plan.items)} objects failed; see {plan.domain.folder / MANIFEST}"
+    failed = pointset.meta["failed"]
+    problem = f"{failed} of {len(plan.tasks)} failed; see {plan.domain.folder / MANIFEST}"
     if failed and plan.options.strict:
         raise DataError(problem)
     if failed:
@@ -203,19 +203,72 @@ def _collect(
     return outcomes
 
 
-def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome]) -> None:
+Made = tuple[ManifestRow, Mapping[str, np.ndarray] | None]
+"""A row of the manifest, and its cloud's arrays; None if there is none."""
+
+
+def _made(plan: Plan, outcomes: list[Outcome]) -> list[Made]:
+    """What each object gave, or all clouds of rooms, class by class."""
+    root = f"{plan.mesh_root}/"  # a manifest is the same wherever the folder lies
+    made: list[Made] = []
+    for item, outcome in zip(plan.tasks, outcomes, strict=True):
+        cloud, reason = outcome.cloud, outcome.reason
+        if plan.options.meshes is not None:
+            reason = reason.replace(root, "")
+        row = ManifestRow(
+            id=item.id,
+            cls=item.cls,
+            split=item.split,
+            seed=plan.options.seed,
+            mesh_sha256=outcome.mesh_sha256,
+            origin=item.origin,
+            views=cloud.views if cloud else None,
+            valid_points=cloud.valid_points if cloud else None,
+            status=OK if cloud else "failed",
+            reason=reason or outcome.note,
+        )
+        if cloud is None or cloud.found is None:
+            made.append((row, cloud.arrays if cloud else None))
+            continue
+        for k, (cls, origin, sha256, points) in enumerate(cloud.found):
+            name = f"{cls}/{item.split}/{item.id.rsplit('/', 1)[1]}_{k:02d}"
+            of = replace(
+                row, id=name, cls=cls, origin=origin, mesh_sha256=sha256, valid_points=points
+            )
+            made.append((of, _OfRoom(cloud.arrays, k)))
+    order = {name: k for k, name in enumerate((*plan.domain.names, ""))}
+    return sorted(made, key=lambda each: order[each[0].cls])
+
+
+class _OfRoom(Mapping[str, np.ndarray]):
+    """The arrays of one cloud of a room, each read when it is asked for."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], k: int) -> None:
+        self._arrays, self._k = arrays, k
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return np.asarray(self._arrays[name][self._k])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)
+
+
+def _draw(domain: Domain, made: Sequence[Made]) -> None:
     """clouds.png, for people only."""
-    clouds: dict[str, list[Any]] = {item.cls: [] for item in items}
-    for item, outcome in zip(items, outcomes, strict=True):
-        if outcome.cloud is not None and len(clouds[item.cls]) < OBJECTS:
-            clouds[item.cls].append(outcome.cloud.arrays)
+    clouds: dict[str, list[Any]] = {row.cls: [] for row, _ in made if row.cls}
+    for row, cloud in made:
+        if cloud is not None and len(clouds[row.cls]) < OBJECTS:
+            clouds[row.cls].append(cloud)
     clouds_picture(domain.folder / CLOUDS, clouds, domain.label)
 
 
 class _Arrays(Sequence[np.ndarray]):
     """One array of many clouds, each read when it is asked for."""
 
-    def __init__(self, clouds: Sequence[Cloud], name: str) -> None:
+    def __init__(self, clouds: Sequence[Mapping[str, np.ndarray]], name: str) -> None:
         self._clouds, self._name = clouds, name
 
     def __len__(self) -> int:
@@ -223,39 +276,23 @@ class _Arrays(Sequence[np.ndarray]):
 
     def __getitem__(self, key: Any) -> Any:
         if isinstance(key, slice):
-            return [cloud.arrays[self._name] for cloud in self._clouds[key]]
-        return self._clouds[key].arrays[self._name]
+            return [cloud[self._name] for cloud in self._clouds[key]]
+        return self._clouds[key][self._name]
 
 
-def _write(plan: Plan, outcomes: list[Outcome], recipe: dict[str, Any]) -> PointSet:
-    own, domain = plan.options.meshes is not None, plan.domain
-    root = f"{plan.mesh_root}/"  # a manifest is the same wherever the folder lies
-    rows = [
-        ManifestRow(
-            id=item.id,
-            cls=item.cls,
-            split=item.split,
-            seed=plan.options.seed,
-            mesh_sha256=outcome.mesh_sha256,
-            origin=item.origin,
-            views=outcome.cloud.views if outcome.cloud else None,
-            valid_points=outcome.cloud.valid_points if outcome.cloud else None,
-            status="ok" if outcome.cloud else "failed",
-            reason=(outcome.reason.replace(root, "") if own else outcome.reason) or outcome.note,
-        )
-        for item, outcome in zip(plan.items, outcomes, strict=True)
-    ]
-    others = plan.mesh_folder.left_alone() if own else []
-    good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
+def _write(plan: Plan, made: Sequence[Made], recipe: dict[str, Any]) -> PointSet:
+    domain = plan.domain
+    others = plan.mesh_folder.left_alone() if plan.options.meshes is not None else []
+    good = [cloud for _, cloud in made if cloud is not None]
     written = write_pointset(
         domain.folder,
         name=domain.folder.name,
         classes=domain.names,
-        arrays={name: _Arrays(good, name) for name in good[0].arrays},
-        rows=rows,
+        arrays={name: _Arrays(good, name) for name in good[0]},
+        rows=[row for row, _ in made],
         meta={
             "simulated": domain.simulated,
-            **made_of(plan, outcomes, recipe).meta,
+            **made_of(plan, [row for row, _ in made], recipe).meta,
             **({"folders_left_alone": {"count": len(others), "names": others}} if others else {}),
             "settings": recipe["settings"],
             "versions": recipe["versions"],
@@ -269,11 +306,11 @@ def _write(plan: Plan, outcomes: list[Outcome], recipe: dict[str, Any]) -> Point
 
 
 def _report(
-    pointset: PointSet, items: list[MeshItem], outcomes: list[Outcome], seconds: float
+    pointset: PointSet, made: Sequence[Made], outcomes: list[Outcome], seconds: float
 ) -> None:
     """Counts a class, failures with their reasons, where things are, and the content hash."""
     failures = [o for o in outcomes if o.cloud is None]
-    failed = Counter(item.cls for item, o in zip(items, outcomes, strict=True) if o.cloud is None)
+    failed = Counter(row.cls for row, cloud in made if cloud is None)
     for line in counts_text(pointset, "failed", failed):
         log.info("%s", line)
     for outcome in failures[:_SHOWN]:

@@ -6,23 +6,20 @@ import functools
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.compose import choices, composed
 from qs3.generation.plan import Plan, recipe_fingerprint
-from qs3.store.meta import MadeOf
-
-if TYPE_CHECKING:
-    from qs3.generation.workers import Outcome
+from qs3.store.meta import OK, MadeOf, ManifestRow
 
 _MATERIALS = {"mixed": "mixed materials", "principled": "principled materials"}
 _LIGHTS = {"area": "light above"}
 
 
-def made_of(plan: Plan, outcomes: Sequence[Outcome], recipe: Mapping[str, Any]) -> MadeOf:
+def made_of(plan: Plan, rows: Sequence[ManifestRow], recipe: Mapping[str, Any]) -> MadeOf:
     """What was made, for figures; of a folder of meshes its last name, and not where it lies."""
     objects = "embedded catalogue"
     if plan.options.meshes is not None:
@@ -30,9 +27,9 @@ def made_of(plan: Plan, outcomes: Sequence[Outcome], recipe: Mapping[str, Any]) 
         # Below `raw/` PyTorch Geometric and `qs3 download` keep what a dataset is made from.
         objects = f"meshes of {(root.parent if root.name == 'raw' else root).name}"
         objects += " and the embedded catalogue" * plan.options.fill_up
-    made = {outcome.item_id for outcome in outcomes if outcome.cloud is not None}
-    there = {item.cls for item in plan.items if item.id in made}
-    several = "\n".join(sorted({outcome.mesh_sha256 for outcome in outcomes} - {""}))
+    made = {row.id for row in rows if row.status == OK}
+    there = {row.cls for row in rows if row.status == OK}
+    several = "\n".join(sorted({row.mesh_sha256 for row in rows} - {""}))
     return MadeOf(
         objects=objects,
         sensor=_sensor(plan.cfg),

@@ -28,10 +28,9 @@ from qs3.classes import CLASSES
 from qs3.config.hydra import build
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError
-from qs3.generation.camera_poses import Drift
 from qs3.generation.kept import Keep, save_view
 from qs3.generation.released import read_poses
-from qs3.generation.room_scans import RoomScan
+from qs3.generation.rooms import Rooms
 from qs3.meshes.folder import SPLITS, MeshFolder
 from qs3.meshes.io import Up
 from qs3.meshes.mesh import MeshItem
@@ -149,6 +148,17 @@ class Plan:
             raise ConfigError(f"two objects would be called {same[0]!r}: rename a mesh file")
         return items
 
+    @functools.cached_property
+    def tasks(self) -> list[MeshItem]:
+        """What is scanned one by one: the objects or, furnished with them, rooms."""
+        if not isinstance(self.recipe, Rooms):
+            return self.items
+        return [
+            MeshItem(f"room/{split}/room_{k:06d}", "", split, partial(_itself, split), "")
+            for split, meshes in self.recipe.shelves.items()
+            for k in range(math.ceil(self.cfg.rooms * len(meshes)))
+        ]
+
     @property
     def catalogue_seed(self) -> int:
         """Of the other half of meshes, another catalogue: those of two seeds share no mesh."""
@@ -232,6 +242,8 @@ class Plan:
             "colliders": plain["colliders"],
             "up": plain["up"],
         }
+        if "rooms" in plain:
+            chosen["rooms"] = plain["rooms"]
         if plain.get("renderer"):
             decisive = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}
             chosen["renderer"] = decisive
@@ -270,6 +282,11 @@ class Plan:
         return f"like {name}, but not it (other settings or objects)"
 
 
+def _itself(split: str) -> Any:
+    """In place of a mesh, what a room is made of."""
+    return split
+
+
 def planned(cfg: DictConfig) -> Plan:
     """Build and judge a config of generate.py."""
     try:
@@ -278,6 +295,10 @@ def planned(cfg: DictConfig) -> Plan:
     except ValidationError as error:
         raise ConfigError(problems(error)) from None
     plan = Plan(cfg, options, build(cfg.domain), build(cfg.recipe))
+    if isinstance(plan.recipe, Rooms):
+        of = {split: tuple(i for i in plan.items if i.split == split) for split in SPLITS}
+        shelves = {split: items for split, items in of.items() if items}
+        plan = replace(plan, recipe=replace(plan.recipe, shelves=shelves))
     there = plan.domain.names if options.meshes else CLASSES
     if unknown := sorted({*(options.classes or plan.domain.names)} - {*there}):
         raise ConfigError(f"classes: {unknown} are not among {', '.join(there)}; see meshes=PATH")
@@ -292,7 +313,7 @@ def _unused(cfg: DictConfig, recipe: Any) -> list[str]:
         return [key for key in _OF_LOOKING if cfg.get(key)]
     no_use = {
         "poses": "poses" not in cfg.recipe,
-        "tracking": isinstance(recipe, RoomScan) and build(cfg.tracking) != Drift(),
+        "provenance": isinstance(recipe, Rooms),
         "materials": not recipe.sensor.sees_light,
         "light": not recipe.sensor.sees_light,
     }

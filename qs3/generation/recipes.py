@@ -8,7 +8,7 @@ written into a dataset's recipe file.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Protocol
+from typing import Annotated, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -35,18 +35,29 @@ _SPARE = 5  # times as many samples as wanted, of which regions may take all but
 Least = Annotated[int, Ge(0)]
 
 
+class Found(NamedTuple):
+    """What one cloud of a room shows: its class, the mesh, and points before sampling."""
+
+    cls: str
+    origin: str
+    mesh_sha256: str
+    valid_points: int
+
+
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """What a recipe makes of one mesh.
 
     `arrays` are [P, 3] float32 by name: "points", and "points_clean" where there is a twin; where
-    it was asked for also "provenance" [P, 5] of "points".
+    it was asked for also "provenance" [P, 5] of "points". Of a room, "points" are [k, P, 3], and
+    `found` says what each shows.
     """
 
     arrays: Mapping[str, np.ndarray]
     views: int  # that gave points
     valid_points: int  # before sampling
     frames: tuple[DepthFrame, ...] = ()  # for looking at
+    found: tuple[Found, ...] | None = None  # of a room
 
 
 class Recipe(Protocol):
@@ -102,7 +113,11 @@ class MaskCrop(BoxCrop):
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray:
         """[h, w] bool."""
-        mask = (frame.label == 1).astype(np.uint8)
+        return self.drawn(frame.label == 1, rng)
+
+    def drawn(self, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """[h, w] bool: as somebody draws the mask `seen`."""
+        mask: np.ndarray = seen.astype(np.uint8)
         grow = int(rng.integers(self.min_grow_px, self.max_grow_px + 1))
         shift = rng.integers(-self.max_shift_px, self.max_shift_px + 1, 2)
         if grow:

@@ -21,7 +21,7 @@ from typing import Any
 from qs3.errors import ConfigError, MeshError, MeshUnavailableError, Qs3Error, RenderError
 from qs3.generation.kept import DiskError, Keep
 from qs3.generation.plan import code_fingerprint
-from qs3.generation.recipes import Cloud, Recipe
+from qs3.generation.recipes import Cloud, Found, Recipe
 from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.sensors.renderers.base import Renderer
@@ -76,10 +76,10 @@ def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
     """Make one object's cloud; failures of the object become an Outcome, not an error."""
     sha256, lasting, unavailable = "", True, False
     try:
-        mesh = item.load()
-        sha256 = mesh.sha256
+        mesh = item.load()  # of a room the split
+        sha256, hidden = getattr(mesh, "sha256", ""), getattr(mesh, "colliders", 0)
         cloud = job.recipe.make(mesh, item.id, job.seed, renderer, job.keep)
-        note = f"{COLLIDERS}: {mesh.colliders}" if mesh.colliders else ""
+        note = f"{COLLIDERS}: {hidden}" if hidden else ""
         return Outcome(item.id, sha256, replace(cloud, frames=()), "", note=note)
     except DiskError:
         raise
@@ -101,14 +101,16 @@ def save_part(parts: PartFiles, outcome: Outcome) -> None:
     }
     for key in ("views", "valid_points"):
         note[key] = getattr(cloud, key) if cloud else 0
+    note["found"] = cloud.found if cloud else None
     parts.write(_name(outcome.item_id), note, cloud.arrays if cloud else {})
 
 
 def load_part(parts: PartFiles, item_id: str) -> Outcome:
     """One outcome; its arrays stay on disk until they are asked for."""
     note, arrays = parts.read(_name(item_id))
-    views, points = note.pop("views"), note.pop("valid_points")
-    cloud = Cloud(arrays, views, points) if arrays else None
+    views, points, found = (note.pop(key) for key in ("views", "valid_points", "found"))
+    found = found if found is None else tuple(Found(*row) for row in found)
+    cloud = Cloud(arrays, views, points, found=found) if arrays or found == () else None
     return Outcome(cloud=cloud, **note)
 
 

@@ -1,13 +1,20 @@
 """What is cut equals what was placed: the core on single images whose every surface is known."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from qs3.datasets.cutting import Limits, Rules, body, cut, occlusion, pieces, rim
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
 from qs3.datasets.nyuv2 import AREA
+from qs3.datasets.picture_kernels import mean_distance
 from tests.fixtures.frame_files import Shot, Thing, kinect
 
 
@@ -51,6 +58,46 @@ def test_an_arm_before_its_seat_is_joined_and_a_wall_behind_is_not(rules):
     np.testing.assert_array_equal(kept, mask & (depth < 2.5))
     piece = cut(image, mask, "default", dataclasses.replace(rules, erode_px=0))
     assert piece.kept == pytest.approx(50 / 70)
+
+
+@given(seed=st.integers(0, 10_000), full=st.floats(0.1, 1))
+def test_pieces_are_those_of_a_graph(seed, full):
+    """Twin: an edge for each two pixels that follow each other, and scipy's components."""
+    rng = np.random.default_rng(seed)
+    height, width = rng.integers(2, 30, 2)
+    depth = 2 + np.cumsum(rng.normal(0, 0.03, (height, width)), axis=1)
+    measured, rules = rng.random(depth.shape) < full, Rules()
+    edges = []
+    for lines, across in ((range(height), False), (range(width), True)):
+        for line in lines:
+            along = np.flatnonzero(measured[:, line] if across else measured[line])
+            for a, b in itertools.pairwise(along):
+                first, second = ((a, line), (b, line)) if across else ((line, a), (line, b))
+                z = sorted((depth[first], depth[second]))
+                if b - a <= rules.bridge_px + 1 and z[1] - z[0] <= max(0.05, 0.03 * z[0]):
+                    edges.append([np.ravel_multi_index(at, depth.shape) for at in (first, second)])
+    pairs = np.array(edges, dtype=int).reshape(-1, 2).T
+    graph = coo_matrix((np.ones(pairs.shape[1]), pairs), (depth.size, depth.size))
+    _, label = connected_components(graph, directed=False)
+    number = pieces(measured, depth, rules)
+    np.testing.assert_array_equal(number >= 0, measured)
+    own, theirs = number[measured], label.reshape(depth.shape)[measured]
+    np.testing.assert_array_equal(own[:, None] == own, theirs[:, None] == theirs)
+    assert (np.diff(np.bincount(own)) <= 0).all() if len(own) else True  # the largest first
+
+
+def test_mean_distances_are_those_of_a_tree():
+    """Twin: of a smooth surface, the nearest points are those of pixels nearby."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[:40, :50]
+    points = np.stack([0.01 * u, 0.012 * v, 2 + 0.2 * np.sin(u / 9) + 0.001 * rng.random(u.shape)])
+    points, own = np.moveaxis(points, 0, -1), rng.random(u.shape) < 0.9
+    mean = mean_distance(points, own, 12, 4)[own]
+    theirs, _ = cKDTree(points[own]).query(points[own], k=13)
+    np.testing.assert_allclose(mean, theirs[:, 1:].mean(axis=1), rtol=1e-6)
+    alone = np.zeros_like(own)
+    alone[3, 3] = True
+    assert np.isinf(mean_distance(points, alone, 12, 4)[3, 3])
 
 
 LEVEL = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]

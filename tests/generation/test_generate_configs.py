@@ -75,8 +75,8 @@ def test_benchmarks_know_themselves_and_their_parts():
         assert benchmark(other).startswith("like kinectsim10 v2, but not it")
     assert benchmark("splits=[train]", other).startswith("like kinectsim10 v2, but not it")
     assert benchmark("splits=[train]") == "kinectsim10 v2, train"
-    assert benchmark(domain="roomscan10") == "roomscan10 v4"
-    assert benchmark("recipe.torn=0.4", domain="roomscan10").startswith("like roomscan10 v4, but")
+    assert benchmark(domain="roomscan10") == "roomscan10 v5"
+    assert benchmark("recipe.by_class=0", domain="roomscan10").startswith("like roomscan10 v5, but")
     assert benchmark(domain="kinectsim10_full") == "kinectsim10_full v1"
 
 
@@ -207,7 +207,7 @@ def test_scans_that_would_share_a_name_are_refused(tmp_path):
         (["domain=modelnet10", "keep_views=true"], "no use"),
         *((["domain=blensor10", word], "no use") for word in ("materials=mixed", "light=area")),
         (["domain=kinectsim10", "poses=a.tar.gz"], "no use for poses"),
-        (["domain=roomscan10", "tracking=drifting"], "no use for tracking"),
+        (["domain=roomscan10", "provenance=true"], "no use for provenance"),
         (["domain=roomscan10", "scene=alone"], "scene"),
         (["domain=modelnet10_dropout", "recipe.dropout.max_share=0.9"], "dropout"),
         (["materials=mixed", "materials.kinds.wood.albedo=[0.4,1.2]"], "wood.albedo"),

@@ -27,7 +27,7 @@ from qs3.sensors.renderers.base import (
     give_memory_back,
 )
 from qs3.sensors.renderers.mitsuba_glossy import GlossyScene
-from qs3.sensors.renderers.mitsuba_jit import JitScene
+from qs3.sensors.renderers.mitsuba_jit import JitScene, Solid
 from qs3.sensors.renderers.mitsuba_scalar import ScalarScene
 from qs3.utils.settings import Count, checked
 
@@ -53,6 +53,7 @@ class MitsubaRenderer:
         self.settings = RendererSettings(samples, threads)
         self._probe = llvm.find_variant(variant)
         self.variant = self._probe.variant
+        self._solid: Solid | None = None
         self._activate()
 
     def render(
@@ -99,7 +100,9 @@ class MitsubaRenderer:
 
     def _build(self, mi: Any, scene: Scene) -> ScalarScene | JitScene:
         if not self.variant.startswith("scalar_"):
-            return JitScene(mi, scene) if scene.plain else GlossyScene(mi, scene)
+            if self._solid is None or self._solid.bodies is not scene.bodies:
+                self._solid = Solid(mi, scene.bodies)  # most pictures show what the last one did
+            return (JitScene if scene.plain else GlossyScene)(mi, scene, self._solid)
         if not scene.plain:
             raise RenderError(
                 f"renderer.variant={self.variant} has matt surfaces and even light only: install "
@@ -133,7 +136,7 @@ def render_probe_scene(variant: str) -> None:
     renderer = object.__new__(MitsubaRenderer)
     renderer.settings = RendererSettings(samples=2)
     renderer.variant = variant
-    renderer._probe = llvm.Probe(variant, path)
+    renderer._probe, renderer._solid = llvm.Probe(variant, path), None
     vertices = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]], dtype=np.float64)
     body = Body(Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]])))
     projector = Projector(np.eye(4), np.ones((8, 8), dtype=np.float32), tan_half_width=1.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from qs3.sensors.renderers.base import Scene
 from qs3.sensors.renderers.gloss import COSINES, Gloss, kept_back
-from qs3.sensors.renderers.mitsuba_jit import TO_UNIT, JitScene
+from qs3.sensors.renderers.mitsuba_jit import TO_UNIT, JitScene, Solid
 
 
 @dataclass
@@ -106,8 +106,8 @@ class GlossyScene(JitScene):
     Its kernel is another one, so that scenes without either keep theirs, and its bytes.
     """
 
-    def __init__(self, mi: Any, scene: Scene) -> None:
-        super().__init__(mi, scene)
+    def __init__(self, mi: Any, scene: Scene, solid: Solid) -> None:
+        super().__init__(mi, scene, solid)
         kinds = [body.gloss or _MATT for body in scene.bodies]
         self._body = mi.UInt32(self.faces.body)
         numbers = [(kind.alpha**2, kind.refractive_index, float(kind.metal)) for kind in kinds]

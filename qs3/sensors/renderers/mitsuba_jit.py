@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ class Faces:
         a, b, c = (self.mesh.vertices[self.mesh.faces[:, i]] for i in range(3))
         return a, b, c
 
+    @cached_property
     def normals(self) -> np.ndarray:
         """[F, 3] float64 unit normals, 0 for degenerate faces."""
         a, b, c = self.corners()
@@ -57,7 +59,7 @@ class Faces:
         valid = face >= 0
         face = np.where(valid, face, 0)
         label = np.where(valid, self.label[face], 0).astype(np.uint8)
-        normals = (self.normals() @ camera.world_from_camera[:3, :3]).astype(np.float32)
+        normals = (self.normals @ camera.world_from_camera[:3, :3]).astype(np.float32)
         return label, incidence(normals[face], valid, camera)
 
 
@@ -77,6 +79,17 @@ _RAY_EPSILON = 1500 * 2.0**-24
 TO_UNIT = 2.0**-32  # of fixed point with 32 bits
 
 
+class Solid:
+    """The bodies of a scene with what finds rays' hits, for any number of pictures and lights."""
+
+    def __init__(self, mi: Any, bodies: tuple[Body, ...]) -> None:
+        self.bodies, self.faces = bodies, Faces.of(bodies)
+        mesh = mitsuba_mesh(mi, self.faces, mi.Properties())
+        self.scene = mi.load_dict({"type": "scene", "bodies": mesh})
+        self.normal = mi.Float(self.faces.normals.astype(np.float32).ravel())
+        self.albedo = mi.Float(self.faces.albedo)
+
+
 class JitScene:
     """A scene for the compiled variants, with our own kernel.
 
@@ -84,15 +97,11 @@ class JitScene:
     in the code, so that the kernels of the first call serve all others.
     """
 
-    def __init__(self, mi: Any, scene: Scene) -> None:
+    def __init__(self, mi: Any, scene: Scene, solid: Solid) -> None:
         import drjit as dr
 
-        self._mi, self._dr = mi, dr
-        self.faces = Faces.of(scene.bodies)
-        mesh = mitsuba_mesh(mi, self.faces, mi.Properties())
-        self._scene = mi.load_dict({"type": "scene", "bodies": mesh})
-        self._normal = mi.Float(self.faces.normals().astype(np.float32).ravel())
-        self._albedo = mi.Float(self.faces.albedo)
+        self._mi, self._dr, self.faces = mi, dr, solid.faces
+        self._scene, self._normal, self._albedo = solid.scene, solid.normal, solid.albedo
         self._ambient = self._opaque(scene.ambient)
         self._epsilon = self._opaque(
             _RAY_EPSILON * (1 + float(np.abs(self.faces.mesh.vertices).max()))

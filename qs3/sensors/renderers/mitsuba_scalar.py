@@ -62,7 +62,7 @@ class ScalarScene:
         """
         x, y = tangents(camera)
         rotation, origin = camera.world_from_camera[:3, :3], camera.world_from_camera[:3, 3]
-        normal = (self.faces.normals() @ rotation)[face]  # [h, w, 3], camera axes
+        normal = (self.faces.normals @ rotation)[face]  # [h, w, 3], camera axes
         corners = np.stack([(corner - origin) @ rotation for corner in self.faces.corners()])
         depths = corners[:, :, 2]
         along = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2]

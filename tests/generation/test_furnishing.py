@@ -1,0 +1,139 @@
+"""Where things stand in a room; each mesh here is a box with a low step at its front (-y)."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.catalogue import Catalogue
+from qs3.generation.furnishing import Furnishing, Habits
+from qs3.generation.scenes import prism, rectangle
+from qs3.meshes.mesh import MeshItem, merge
+
+SEEDS = st.integers(0, 10_000)
+
+
+def box(width, depth, height):
+    """Its first four vertices are the lower corners of its back half, the step is lower."""
+    half = np.array([width, depth]) / 2
+    back = prism(rectangle(np.array([-half[0], 0.0]), half), 0.0, height)
+    return merge([back, prism(rectangle(-half, np.array([half[0], 0.0])), 0.0, height / 2)])
+
+
+SIZES = {"chest": (0.8, 0.5, 0.7), "stool": (0.4, 0.4, 0.5), "cup": (0.1, 0.1, 0.15)}
+ITEMS = [
+    MeshItem(f"{cls}/train/{cls}_0", cls, "train", partial(box, *size), "")
+    for cls, size in SIZES.items()
+]
+
+
+def furnish(seed, **habits):
+    """A room of the items that have habits."""
+    own = [item for item in ITEMS if item.cls in habits]
+    law = Furnishing(habits=habits, things=(4, 9))
+    return law.furnish(lambda rng: own[int(rng.integers(len(own)))], np.random.default_rng(seed))
+
+
+def back_and_front(thing):
+    """[2] middles of its back half and of its step, on the floor."""
+    return thing.mesh.vertices[:8, :2].mean(axis=0), thing.mesh.vertices[8:, :2].mean(axis=0)
+
+
+def overlap(a, b):
+    """Whether two upright boxes [16, 3] share a place: no side of either parts them."""
+    for corners in (a, b):
+        for k in range(2):
+            side = corners[k + 1, :2] - corners[k, :2]
+            one, other = (each[:, :2] @ side for each in (a, b))
+            if one.max() <= other.min() or other.max() <= one.min():
+                return False
+    return True
+
+
+@given(seed=SEEDS)
+def test_things_are_in_the_room_and_apart(seed):
+    room = furnish(seed, chest="wall", stool="floor")
+    assert room.things
+    corners = [thing.mesh.vertices for thing in room.things]
+    for one in corners:
+        assert (one[:, :2] > -0.05).all()
+        assert (one[:, :2] < room.size_m + 0.05).all()
+        assert one[:, 2].min() == 0
+    for i, one in enumerate(corners):
+        for other in corners[:i]:
+            shrunk = one * 0.9 + one.mean(axis=0) * 0.1  # the map of the floor has cells of 5 cm
+            assert not overlap(shrunk, other)
+
+
+@given(seed=SEEDS)
+def test_what_stands_at_a_wall_has_its_back_there(seed):
+    room = furnish(seed, chest="wall")
+    at_wall = 0
+    for thing in room.things:
+        back, front = back_and_front(thing)
+        gaps = [np.minimum(place, room.size_m - place) for place in (back, front)]
+        wall = int(np.argmin(gaps[0]))
+        at_wall += gaps[0][wall] < 0.25 + 0.08 / 2 and gaps[0][wall] < gaps[1][wall]
+    assert at_wall >= len(room.things) - 2  # where walls are full, it stands elsewhere
+
+
+@given(seed=SEEDS)
+def test_what_is_drawn_up_to_a_table_faces_it(seed):
+    room = furnish(seed, stool=Habits(table=1.0))
+    boards = [mesh for mesh in room.others if 0.7 <= mesh.bounds[1, 2] <= 0.78]
+    facing = 0
+    for thing in room.things:
+        back, front = back_and_front(thing)
+        middles = np.stack([board.bounds.mean(axis=0)[:2] for board in boards])
+        nearest = middles[np.linalg.norm(middles - front, axis=1).argmin()]
+        facing += np.linalg.norm(front - nearest) < np.linalg.norm(back - nearest)
+    assert facing >= len(room.things) - 5  # a table has four sides; others stand anywhere
+    assert facing or not room.things
+
+
+@given(seed=SEEDS)
+def test_what_stands_on_something_is_held_and_holds_a_place_of_its_own(seed):
+    room = furnish(seed, chest="floor", cup="top")
+    carriers = [t.mesh for t in room.things if t.cls == "chest"] + room.others
+    cups = [thing.mesh.vertices for thing in room.things if thing.cls == "cup"]
+    for k, cup in enumerate(cups):
+        heights = [mesh.vertices[:, 2] for mesh in carriers]
+        assert min(np.abs(z - cup[:, 2].min()).min() for z in heights) < 1e-3
+        assert 0.35 <= cup[:, 2].min() <= 1.45
+        for other in cups[:k]:
+            apart = abs(cup[:, 2].min() - other[:, 2].min()) > 0.15
+            assert apart or not overlap(cup, other)
+
+
+@given(seed=SEEDS)
+def test_what_hangs_is_at_a_wall_above_the_floor(seed):
+    room = furnish(seed, chest=Habits(hung=1.0))
+    for thing in room.things:
+        assert 1.2 <= thing.mesh.bounds[0, 2] <= 1.5
+        back, _ = back_and_front(thing)
+        assert np.minimum(back, room.size_m - back).min() < 0.3
+
+
+def test_habits_are_drawn_as_often_as_they_are_likely():
+    habits, rng = Habits(wall=0.5, top=0.3), np.random.default_rng(0)
+    drawn = [habits.draw(rng) for _ in range(4000)]
+    shares = {how: drawn.count(how) / 4000 for how in ("wall", "table", "top", "hung", "floor")}
+    assert shares == pytest.approx(
+        {"wall": 0.5, "table": 0, "top": 0.3, "hung": 0, "floor": 0.2}, abs=0.03
+    )
+
+
+def test_a_class_without_habits_has_the_default_ones():
+    law = Furnishing(habits={"default": "top", "chest": "wall"})
+    assert (law.of("cup").top, law.of("chest").wall, Furnishing().of("cup")) == (1, 1, Habits())
+
+
+@given(seed=SEEDS)
+def test_rooms_of_the_catalogue_are_full(seed):
+    items = Catalogue(seed=1, train=2, test=0).items()
+    rng = np.random.default_rng(seed)
+    room = Furnishing(things=(25, 25)).furnish(lambda r: items[int(r.integers(20))], rng)
+    assert len(room.things) >= 4
+    assert all(np.isfinite(mesh.vertices).all() for mesh in room.others)
