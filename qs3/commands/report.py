@@ -234,7 +234,6 @@ def page(
     *,
     data_dir: Annotated[Path | None, "where its datasets are, if they have moved"] = None,
     out: Annotated[Path | None, "where the files go (default: RUN/pictures)"] = None,
-    packages: Annotated[tuple[str, ...], "where a net of one's own is defined; run"] = (),
 ) -> None:
     """Draw the pictures and the page of one run.
 
@@ -243,7 +242,7 @@ def page(
     """
     from qs3.report.run_page import draw
 
-    drawn = draw(run, out, data_dir=data_dir, packages=packages)
+    drawn = draw(run, out, data_dir=data_dir)
     for name, reason in drawn.skipped.items():
         print(f"no {name}: {reason}")
     print(*drawn.pictures.values(), drawn.page, sep="\n")

@@ -10,7 +10,7 @@ import dataclasses
 import logging
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -35,7 +35,6 @@ from qs3.store.store import PointSet
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.page import render
 from qs3.utils.pictures import save_png
-from qs3.utils.seeding import derive
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,8 +44,6 @@ log = logging.getLogger(__name__)
 
 FOLDER, PAGE, HISTORY = "pictures", "index.html", "history.csv"
 _CLOUDS, _POINTS = 30, 1024  # on the page: a quarter of a megabyte a run
-_FEATURES = 600  # clouds of each domain in the picture of features
-_WARMUP = "warmup_selected.pt"  # of qs3.selftraining.callback, which imports Lightning
 _DOMAIN = tuple(field.name for field in dataclasses.fields(Domain))
 
 
@@ -111,8 +108,11 @@ def read_run(folder: str | Path) -> RunFiles:
     return RunFiles(folder, metrics, history, predictions, classes, hydra["config"], command)
 
 
-def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> Domain:
-    """A domain ("source" or "target") as the run's config describes it."""
+def _target_of(run: RunFiles, data_dir: str | Path | None) -> tuple[Domain, PointSet]:
+    """The target as the run's config describes it, and its dataset, if it is the one that was used.
+
+    Nothing is imported or made.
+    """
     from omegaconf import OmegaConf
 
     import qs3.config.hydra  # noqa: F401 (registers the resolvers of a config)
@@ -122,23 +122,18 @@ def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> D
     cfg = OmegaConf.create(dict(run.config))
     if data_dir is not None:
         cfg.paths.data_dir = str(Path(data_dir).absolute())
-    found: Any = OmegaConf.to_container(cfg.data[role], resolve=True)
+    found: Any = OmegaConf.to_container(cfg.data.target, resolve=True)
     # Not instantiated: the folder may be somebody else's, and a config can name any code.
     about = {key: found[key] for key in _DOMAIN if key in found}
-    return Domain(**{**about, "published": None, "synthesis": None})
-
-
-def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) -> PointSet:
-    """A domain's dataset, if it is the one that the run used. Nothing is imported or made."""
-    domain = domain_of(run, role, data_dir)
+    domain = Domain(**{**about, "published": None, "synthesis": None})
     if run.metrics is None or not is_finished(domain.folder):
-        raise MissingDataError(f"the run's {role}, {domain.name}, is not at {domain.folder}")
+        raise MissingDataError(f"the run's target, {domain.name}, is not at {domain.folder}")
     data = domain.open(verify=False)
-    if data.sha256 != getattr(run.metrics.data, role):
+    if data.sha256 != run.metrics.data.target:
         raise MissingDataError(
             f"{domain.folder} holds another version of {domain.name} than the run used"
         )
-    return data
+    return domain, data
 
 
 class Drawn(NamedTuple):
@@ -154,9 +149,7 @@ def draw(
     out: str | Path | None = None,
     *,
     data_dir: str | Path | None = None,
-    embed: bool = True,
     config: Mapping[str, Any] | None = None,
-    packages: Sequence[str] = (),
 ) -> Drawn:
     """Draw a run's pictures; those of an earlier call are replaced.
 
@@ -164,9 +157,7 @@ def draw(
         folder: of the run.
         out: folder for the files; None: `pictures` in the run's.
         data_dir: where the datasets lie; None: where the run's config says.
-        embed: also show the features of both domains; takes a minute.
         config: of the run; None: what Hydra wrote into its folder.
-        packages: where a net of one's own is defined, beside those of qs3; the code there is run.
     """
     from omegaconf import OmegaConf
 
@@ -177,22 +168,14 @@ def draw(
     pictures: dict[str, Path] = {}
     skipped: dict[str, str] = {}
     clouds: dict[str, Any] = {"about": (), "notes": (), "data": None}
-    for name in ("curves", "embedding"):
-        path = out / f"{name}.png"
-        path.unlink(missing_ok=True)
-        try:
-            if name == "curves":
-                save_png(_curves(run), path)
-            elif embed:
-                save_png(_embedding(run, data_dir, packages), path)
-            else:
-                continue
-            pictures[name] = path
-        except Qs3Error as error:  # damaged data cost their pictures alone
-            skipped[name] = str(error)
+    if run.history is None:
+        skipped["curves"] = "no epoch is done yet"
+    else:
+        pictures["curves"] = out / "curves.png"
+        save_png(_curves(run, run.history), pictures["curves"])
     try:
         clouds = viewer([worst_clouds(run, _CLOUDS, data_dir=data_dir)], points=_POINTS)
-    except Qs3Error as error:
+    except Qs3Error as error:  # damaged data cost their pictures alone
         skipped["clouds"] = str(error)
     m = run.metrics
     rounds = run_charts.pseudo_labels(m.rounds, run.classes) if m and m.rounds else None
@@ -218,57 +201,13 @@ def draw(
     return Drawn(pictures, skipped, out / PAGE)
 
 
-def _curves(run: RunFiles) -> Figure:
-    if run.history is None:
-        raise MissingDataError("no epoch is done yet")
+def _curves(run: RunFiles, history: pd.DataFrame) -> Figure:
     marked = {}
     if m := run.metrics:
         marked = {"teacher": m.warmup.selected.epoch}
         marked |= {"student": m.student.epoch} if m.student else {}
     marked = {who: epoch for who, epoch in marked.items() if epoch >= 0}
-    return run_charts.curves(f"{run.title}: training", run.history, marked)
-
-
-def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[str]) -> Figure:
-    """PCA of the global features of test clouds of source and target, before and after.
-
-    "Before" are the weights that the warm-up selected, "after" those of the result: without rounds
-    they are the same, and there is one panel. Which clouds follows from the run's seed.
-    """
-    from qs3.datamodules.clouds import load_clouds
-    from qs3.evaluation.metrics import global_features
-    from qs3.inference.model_file import PACKAGES, build_net, read_result
-    from qs3.runs.checkpoints import load
-
-    sets = {role: open_domain(run, role, data_dir) for role in ("source", "target")}
-    assert run.metrics is not None
-    result, packages = read_result(run.folder), (*PACKAGES, *packages)
-    nets = {"result": build_net(result, packages)}
-    if run.metrics.rounds and (run.folder / _WARMUP).is_file():
-        before = dataclasses.replace(result, weights=load(run.folder / _WARMUP))
-        nets = {"after the warm-up": build_net(before, packages),
-                "after self-training": nets["result"]}  # fmt: skip
-    parts, labels, names = {}, [], []
-    for role, data in sets.items():
-        split = "test" if "test" in data.counts() else "train"
-        points = load_clouds(data, split, result.points, scale=result.scale).points
-        rng = np.random.default_rng(derive(run.metrics.seed, "embedding", role))
-        chosen = np.sort(rng.permutation(len(points))[:_FEATURES])
-        parts[role] = points[chosen]
-        labels.append(np.array(data.labels[data.indices(split)])[chosen])
-        names.append(f"{role}: {data.name}, {split}")
-    features = {
-        title: np.concatenate(
-            [global_features(net, part, 32, domain=role) for role, part in parts.items()]
-        )
-        for title, net in nets.items()
-    }
-    colours = "colours are true classes, evaluation only"
-    if (labels[1] < 0).all():
-        colours = "colours are the source's classes; those of the target are not known"
-    title = f"{run.title}, on {run.target}: features of clouds (PCA)\n{colours}"
-    domain = np.repeat([0, 1], [len(part) for part in labels])
-    return run_charts.embedding(title, features, np.concatenate(labels), domain, run.classes, names)
+    return run_charts.curves(f"{run.title}: training", history, marked)
 
 
 def worst_clouds(
@@ -286,10 +225,9 @@ def worst_clouds(
     sure = p.probabilities.max(axis=1)
     order = np.lexsort((np.where(wrong, -sure, sure), ~wrong))
     chosen = [int(i) for i in order if match in p.ids[i]][:most]
-    data = open_domain(run, "target", data_dir)
+    domain, data = _target_of(run, data_dir)
     place = {id_: i for i, id_ in enumerate(data.ids)}
-    opened = opened_domain(domain_of(run, "target", data_dir), data)
-    part = part_of(opened, [place[p.ids[i]] for i in chosen])
+    part = part_of(opened_domain(domain, data), [place[p.ids[i]] for i in chosen])
     shown = [
         dataclasses.replace(
             one,
@@ -309,7 +247,7 @@ def worst_clouds(
 
 @dataclass(frozen=True)
 class AfterTraining:
-    """Draws a finished run's pictures ("auto": not in a sweep), also for wandb's active run.
+    """Gives a finished run's scores to wandb, and draws its pictures ("auto": not in a sweep).
 
     A picture that cannot be made is a warning: the result is saved already.
     """
@@ -318,24 +256,15 @@ class AfterTraining:
 
     def __call__(self, folder: Path, config: Mapping[str, Any] | None = None) -> None:
         """Draw those of the run in `folder`, by its composed config or the one that lies there."""
+        wandb: Any = sys.modules.get("wandb")  # not imported: there is no such logger
+        if wandb is not None and wandb.run is not None and (m := read_metrics(folder)):
+            final = {f"final/{k}": v for k, v in vars(m.final).items() if isinstance(v, float)}
+            wandb.run.summary.update(final)
         if not self.pictures or (self.pictures == "auto" and in_multirun()):
             return
         try:
-            drawn = draw(folder, embed=False, config=config)
-            _log_to_wandb(drawn, read_metrics(folder))
-            log.info("pictures: %s", drawn.page)
+            log.info("pictures: %s", draw(folder, config=config).page)
         except Exception as error:
             why = f"{type(error).__name__}: {error}"
             again = f"qs3 report page run={folder} draws them again"
             log.warning("the run is finished, but its pictures failed (%s); %s", why, again)
-
-
-def _log_to_wandb(drawn: Drawn, metrics: RunMetrics | None) -> None:
-    wandb: Any = sys.modules.get("wandb")  # not imported: there is no such logger
-    if wandb is None or wandb.run is None or metrics is None:
-        return
-    wandb.run.log(
-        {f"pictures/{name}": wandb.Image(str(path)) for name, path in drawn.pictures.items()}
-    )
-    final = {key: value for key, value in vars(metrics.final).items() if isinstance(value, float)}
-    wandb.run.summary.update({f"final/{key}": value for key, value in final.items()})

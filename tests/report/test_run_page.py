@@ -11,15 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from qs3.config.hydra import config_sha256, run_folder
 from qs3.errors import DataError, MissingDataError
-from qs3.inference.model_file import Result, write_result
-from qs3.models.pointnet import pointnet
 from qs3.report import run_charts, run_page
 from qs3.report.run_page import AfterTraining, draw, read_run
-from qs3.runs.checkpoints import save
 from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
 from qs3.runs.predictions import read_predictions, write_predictions
 from qs3.training.command import train
@@ -42,13 +38,13 @@ def line(ax, label):
 
 
 def test_files_and_page(run, tmp_path):
-    drawn = draw(run, embed=False)
+    drawn = draw(run)
     assert list(drawn.pictures) == ALL
     assert drawn.skipped == {}
     for name, path in drawn.pictures.items():
         assert path == run / "pictures" / f"{name}.png"
         assert not_blank(path), name
-    again = draw(run, tmp_path / "elsewhere", embed=False)
+    again = draw(run, tmp_path / "elsewhere")
     for name, path in again.pictures.items():
         assert path.read_bytes() == drawn.pictures[name].read_bytes(), name
     page = drawn.page.read_text()
@@ -77,7 +73,10 @@ def test_curves_are_the_history(run):
     scores = {"4": 0.1, "5": 0.3, "6": 0.2}
     student = StudentChoice(rule="snd", epoch=5, score=0.3, scores=scores, held_out=0, last=last)
     change(run, student=student)
-    rows, axes = table(run / "history.csv"), run_page._curves(read_run(run)).axes
+    rows, axes = (
+        table(run / "history.csv"),
+        run_page._curves(read_run(run), read_run(run).history).axes,
+    )
     loss, accuracy = line(axes[0], "train/loss"), line(axes[1], "source_val/acc")
     from_1 = [int(row["epoch"]) + 1 for row in rows]
     np.testing.assert_allclose(loss, [from_1, [float(row["train/loss"]) for row in rows]])
@@ -112,7 +111,7 @@ def test_a_net_that_has_diverged_has_a_page_that_browsers_read(run):
     lost = replace(p, probabilities=np.full_like(p.probabilities, np.nan))
     write_predictions(run / "predictions.csv", lost)
     (run / "history.csv").write_text(NO_EPOCH)
-    page = draw(run, embed=False).page.read_text()
+    page = draw(run).page.read_text()
     assert {one["sure"] for one in data_of(page)["clouds"]} == {None}
 
 
@@ -127,20 +126,17 @@ def test_unlabelled_target(run):
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows({**row, "label": ""} for row in rows)
-    page = draw(run, embed=False).page.read_text()
+    page = draw(run).page.read_text()
     assert "in doubt first" in page
     assert "is \\ called" not in page
     assert "recall (evaluation only)" not in page
 
 
-def test_unfinished_run_and_stale_pictures(run):
+def test_unfinished_run(run):
     (run / "metrics.json").unlink()
     (run / "predictions.csv").unlink()
-    (run / "pictures").mkdir()
-    (run / "pictures" / "embedding.png").touch()
     drawn = draw(run)
     assert list(drawn.pictures) == ["curves"]
-    assert not (run / "pictures" / "embedding.png").exists()
     assert "not finished" in drawn.page.read_text()
     (run / "history.csv").write_text(NO_EPOCH)
     assert "no epoch" in draw(run).skipped["curves"]
@@ -160,61 +156,27 @@ def test_unfinished_run_and_stale_pictures(run):
 def test_damaged_files_are_named(run, name, text):
     (run / name).write_text(text)
     with pytest.raises(DataError, match=re.escape(name.split("/")[0])):
-        draw(run, embed=False)
+        draw(run)
 
 
-def use_real_net(run, target="qs3.models.pointnet.pointnet"):
-    """A small net of ours in place of the toy's, with features."""
-    torch.manual_seed(0)
-    model = {"_target_": target, "num_classes": 3, "variant": "basic"}
-    first, second = (pointnet(num_classes=3, variant="basic").state_dict() for _ in range(2))
-    save(first, run / "warmup_selected.pt")
-    result = Result(model, CLASSES, 32, 64, "kinectsim10", "z", "unit_ball", {}, second)
-    write_result(run / "result.pt", result)
-
-
-def own_net(num_classes, variant):
-    return pointnet(num_classes=num_classes, variant=variant)
-
-
-@pytest.mark.slow
-def test_command_with_a_net_of_ones_own(run, toy_data, tmp_path, capsys):
-    use_real_net(run, f"{__name__}.own_net")
-    assert f"{__name__}.own_net" in draw(run).skipped["embedding"]
+def test_command(run, toy_data, tmp_path, capsys):
     out = tmp_path / "out"
-    words = ["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]
-    assert main([*words, f"packages={__name__}"]) == 0
-    shown = [*(f"{name}.png" for name in ("curves", "embedding")), "index.html"]
-    assert capsys.readouterr().out.splitlines() == [str(out / name) for name in shown]
-    assert not_blank(out / "embedding.png")
+    assert main(["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
+    shown = [str(out / name) for name in ("curves.png", "index.html")]
+    assert capsys.readouterr().out.splitlines() == shown
 
 
 def test_missing_or_damaged_data_cost_their_pictures_and_not_the_page(run, toy_data, tmp_path):
-    use_real_net(run)
     (run / "history.csv").write_text(NO_EPOCH)
     data_dir = tmp_path / "copy"
     shutil.copytree(toy_data, data_dir)
     (data_dir / "kinectsim10" / "points.npy").write_bytes(b"no array")
     drawn = draw(run, data_dir=data_dir)
-    assert {*drawn.skipped} == {"curves", "embedding", "clouds"}
-    assert "<li>embedding: " in drawn.page.read_text()
+    assert {*drawn.skipped} == {"curves", "clouds"}
+    assert "<li>clouds: " in drawn.page.read_text()
     assert "is not at" in draw(run, data_dir=tmp_path).skipped["clouds"]
     change(run, data=DataHashes(source="0" * 64, target="0" * 64))
-    assert "another version of kinectsim10" in draw(run, embed=False).skipped["clouds"]
-
-
-def test_features_of_both_domains_on_the_plane_of_largest_variance():
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(40, 6)) * [5, 1, 0.1, 0.1, 3, 0.1]
-    places = run_charts.pca(x)
-    assert places.var(axis=0) == pytest.approx(np.linalg.eigvalsh(np.cov(x.T, bias=True))[:3:-1])
-    np.testing.assert_allclose(run_charts.pca(x + 9), places, atol=1e-9)
-    labels, domain = np.tile([0, 1, 1, -1], 10), np.repeat([0, 1], 20)
-    nets = {"before": x, "after": x**2}
-    figure = run_charts.embedding("t", nets, labels, domain, ("a", "b"), ("s", "t"))
-    assert [ax.get_title() for ax in figure.axes] == ["before", "after"]
-    for ax in figure.axes:
-        assert sum(len(dots.get_offsets()) for dots in ax.collections) == 40
+    assert "another version of kinectsim10" in draw(run).skipped["clouds"]
 
 
 def test_training_draws_and_its_hash_does_not_know(toy):
@@ -236,23 +198,17 @@ def test_a_failed_picture_is_a_warning(run, caplog):
 
 
 @pytest.mark.slow
-def test_offline_wandb_gets_curves_and_pictures(toy, monkeypatch):
+def test_offline_wandb_gets_curves(toy, monkeypatch):
     from wandb.sdk.wandb_run import Run
 
     rows, log = [], Run.log
     monkeypatch.setattr(Run, "log", lambda run, row, *a: rows.append(row) or log(run, row, *a))
-    cfg = toy("logger=wandb", "report.pictures=true")
+    cfg = toy("logger=wandb")
     train(cfg)
     folder = run_folder(cfg)
     history = table(folder / "history.csv")
     losses = [row["train/loss"] for row in rows if "train/loss" in row]
     assert losses == pytest.approx([float(row["train/loss"]) for row in history])
-    assert {key for row in rows for key in row if "pictures/" in key} == {
-        f"pictures/{name}" for name in ALL
-    }
-    images = [path.read_bytes() for path in folder.glob("wandb/offline-run-*/files/media/*/*/*")]
-    for name in ALL:
-        assert (folder / "pictures" / f"{name}.png").read_bytes() in images
     # The warm-up comes from that run: its epochs are in this one's log, too.
     rows.clear()
     train(toy("logger=wandb", "selftraining.theta=0.3"))
