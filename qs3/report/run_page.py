@@ -1,7 +1,7 @@
 """A run's page: its results, charts as files in `<run>/pictures`, and clouds with predictions.
 
 What an unfinished run does not have is None. A chart that has nothing to show is left out, and the
-page gives the reason.
+page gives the reason. Labels of the target judge a finished run; nothing is chosen by them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import dataclasses
 import logging
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -23,18 +23,17 @@ from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.inference.page import confusion_rows
-from qs3.report import run_charts
 from qs3.report.datasets import opened_domain, part_of
 from qs3.report.viewer import Part, viewer
 from qs3.runs import folder as runs
-from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
+from qs3.runs.metrics import METRICS, RoundRecord, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.store.meta import is_finished
 from qs3.store.store import PointSet
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.page import render
-from qs3.utils.pictures import save_png
+from qs3.utils.pictures import BLUE, GREEN, GRID, ORANGE, RED, SOFT, blank, save_png
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,11 +68,6 @@ class RunFiles:
         if self.metrics is None:
             return f"{self.folder.parent.name}/{self.folder.name} (not finished)"
         return f"{self.metrics.experiment}, seed {self.metrics.seed}"
-
-    @property
-    def target(self) -> str:
-        """The target's name, with "(simulated)" where that is so."""
-        return "the target" if self.metrics is None else self.metrics.target_text
 
 
 def is_run(folder: Path) -> bool:
@@ -178,7 +172,7 @@ def draw(
     except Qs3Error as error:  # damaged data cost their pictures alone
         skipped["clouds"] = str(error)
     m = run.metrics
-    rounds = run_charts.pseudo_labels(m.rounds, run.classes) if m and m.rounds else None
+    rounds = pseudo_labels(m.rounds, run.classes) if m and m.rounds else None
     page = render(
         "run.html",
         title=run.title,
@@ -202,12 +196,73 @@ def draw(
 
 
 def _curves(run: RunFiles, history: pd.DataFrame) -> Figure:
-    marked = {}
+    """Loss, held-out accuracy in percent and learning rate over the epochs, phases shaded.
+
+    `history` has a row an epoch; the epochs of teacher and student are marked.
+    """
+    figure = blank(8.5, 7.2, 130, constrained=True)
+    figure.suptitle(f"{run.title}: training", fontsize=11)
+    axes = figure.subplots(3, sharex=True, gridspec_kw={"height_ratios": (1.0, 1.0, 0.6)})
+    epochs = history["epoch"] + 1  # people count from 1
+    panels = {
+        "training loss": [name for name in history if "loss" in name],
+        "held-out accuracy in %": [name for name in history if name.endswith("_val/acc")],
+        "learning rate": ["lr"],
+    }
+    for ax, (label, names) in zip(axes, panels.items(), strict=True):
+        for name, colour in zip(names, (BLUE, ORANGE, GREEN, RED), strict=False):
+            known = (100 if "acc" in name else 1) * history[name].dropna()
+            ax.plot(epochs[known.index], known, ".-", color=colour, label=name, linewidth=1.3,
+                    markersize=4)  # fmt: skip
+        ax.set_ylabel(label)
+        ax.grid(axis="y", color=GRID, linewidth=0.7)
+        ax.tick_params(labelsize=9, color=GRID)
+        ax.set_axisbelow(True)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.spines[["left", "bottom"]].set_color(GRID)
+    axes[1].set_ylim(0, 102)
+    axes[2].set(ylim=(0, None), xlabel="epoch")
+    for phase, of in history.groupby("phase")["epoch"]:
+        for ax in axes[: 3 * (phase % 2 == 0)]:
+            ax.axvspan(of.min() + 0.5, of.max() + 1.5, color="#f0f3f7", zorder=0, linewidth=0)
+        axes[0].text(of.mean() + 1, 1.02, "warm-up" if phase == 0 else phase - 1, ha="center",
+                     transform=axes[0].get_xaxis_transform(), fontsize=8.5,
+                     color=SOFT)  # fmt: skip
+    marked = {}  # epochs from 0; -1 where there is none
     if m := run.metrics:
         marked = {"teacher": m.warmup.selected.epoch}
         marked |= {"student": m.student.epoch} if m.student else {}
-    marked = {who: epoch for who, epoch in marked.items() if epoch >= 0}
-    return run_charts.curves(f"{run.title}: training", history, marked)
+    for (name, epoch), colour in zip(marked.items(), (RED, GREEN), strict=False):
+        for ax in axes if epoch >= 0 else ():
+            ax.axvline(epoch + 1, color=colour, linestyle="--", linewidth=1.1,
+                       label=f"{name}: epoch {epoch + 1}")  # fmt: skip
+    for ax in axes[:2]:
+        ax.legend(fontsize=8.5, frameon=False)
+    return figure
+
+
+def pseudo_labels(rounds: Sequence[RoundRecord], classes: Sequence[str]) -> pd.DataFrame:
+    """Of each round (column): by class selected/confident and mu or the threshold; theta.
+
+    And what they are worth: precision and recall know the target's labels, which judge alone.
+    """
+    import pandas as pd
+
+    columns = {}
+    for one in rounds:
+        kept, by_class = ("thresholds", one.thresholds) if one.mu is None else ("mu", one.mu)
+        column: dict[str, Any] = {}
+        for name in classes:
+            share = f", {kept} {by_class[name]:.2f}" if by_class and name in by_class else ""
+            column[name] = f"{one.selected.get(name, 0)}/{one.confident.get(name, 0)}{share}"
+        column["theta"] = one.theta
+        if one.agreement is not None:
+            column["same label as before"] = one.agreement
+        if judged := one.with_target_labels:
+            column["precision (evaluation only)"] = judged.precision
+            column["recall (evaluation only)"] = judged.recall
+        columns[f"round {one.round}"] = column
+    return pd.DataFrame(columns)
 
 
 def worst_clouds(
@@ -239,7 +294,7 @@ def worst_clouds(
     ]
     first = f"{wrong.sum()} are wrong, the most confident" if wrong.any() else "in doubt"
     about = (
-        f"{run.title}, target {run.target}: {len(shown)} of {len(p.ids)} clouds; {first} first; "
+        f"{run.title}, target {m.target_text}: {len(shown)} of {len(p.ids)} clouds; {first} first; "
         f"the target is made of: {m.made_of.target}; trained on {m.source} ({m.made_of.source})"
     )
     return dataclasses.replace(part, shown=shown, about=about)

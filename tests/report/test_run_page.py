@@ -14,7 +14,7 @@ import pytest
 
 from qs3.config.hydra import config_sha256, run_folder
 from qs3.errors import DataError, MissingDataError
-from qs3.report import run_charts, run_page
+from qs3.report import run_page
 from qs3.report.run_page import AfterTraining, draw, read_run
 from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
 from qs3.runs.predictions import read_predictions, write_predictions
@@ -91,7 +91,7 @@ def test_curves_are_the_history(run):
 
 def test_pseudo_labels_are_those_of_the_tables(run):
     records = read_metrics(run).rounds
-    shown = run_charts.pseudo_labels(records, CLASSES)
+    shown = run_page.pseudo_labels(records, CLASSES)
     for r, record in enumerate(records):
         rows = table(run / f"round_{r:02d}" / "pseudo_labels.csv")
         kept = Counter(row["label"] for row in rows if row["selected"] == "1")
