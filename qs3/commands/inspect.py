@@ -18,36 +18,33 @@ def inspect(
     *,
     data_dir: _Data = None,
     sample: Annotated[int, Ge(1), "clouds measured one by one; of more, some are drawn"] = 3000,
-    out: Annotated[Path | None, "where text and pictures go (out/inspection/NAME)"] = None,
+    out: Annotated[Path | None, "where text, table and page go (out/inspection/NAME)"] = None,
     **overrides: Annotated[str, "of the domain's config, e.g. published.folder=PATH"],
 ) -> None:
     """What a dataset is like, before training on it.
 
     What it is made of, counts by class and split, sizes, spacing, density, coverage, copies, leaks
-    from train to test; a contact sheet of all classes and a page where clouds can be turned.
-    Published files are imported first.
+    from train to test; a page where clouds of all classes can be turned. Published files are
+    imported first.
 
     Example:
         qs3 inspect domain=own published.folder=scans
         qs3 inspect data/specklenet10 variant=points_clean
     """
     from qs3.report.datasets import chosen, open_named, part_of
-    from qs3.report.inspection import class_sheet, domain_text, measured
+    from qs3.report.inspection import domain_text, measured
     from qs3.report.viewer import page
     from qs3.utils.files import make_folder, write_text
-    from qs3.utils.pictures import save_png
 
     opened = open_named(domain, _with(data_dir, overrides))
-    data, split = opened.data, next(iter(opened.data.counts()))
     clouds = measured(opened, sample)
-    text, heading = domain_text(opened, clouds), f"{opened.label}, {split}"
+    text = domain_text(opened, clouds)
     folder = make_folder(out or _OUT / _name(opened.name, opened.variant))
     write_text(folder / "inspection.csv", clouds.to_csv(index=False))
     write_text(folder / "inspection.txt", text + "\n")
-    save_png(class_sheet(data, split, heading), folder / "clouds.png", colours=256)
-    part = part_of(opened, chosen(data, _TURNABLE))
+    part = part_of(opened, chosen(opened.data, _TURNABLE))
     write_text(folder / "clouds.html", page(opened.label, [part]))
-    print(f"{text}\n\nsaved text, table, pictures and clouds.html in {folder}")
+    print(f"{text}\n\nsaved text, table and clouds.html in {folder}")
 
 
 def compare(
@@ -96,7 +93,6 @@ def view(
     out: Annotated[Path, "the page"] = Path("view.html"),
     clouds: Annotated[int, Interval(ge=1, le=500), "at most so many"] = 50,
     points: Annotated[int | None, Interval(ge=1, le=200_000), "of each cloud"] = None,
-    colour: Annotated[Literal["", "height", "class", "confidence"], "shown first"] = "",
     match: Annotated[str, "only clouds with this in their names"] = "",
     up: Annotated[Literal["x", "y", "z", "-x", "-y", "-z"], "of files: what points up"] = "z",
     variant: Annotated[str, "of a dataset, such as points_clean"] = "",
@@ -116,7 +112,7 @@ def view(
 
     Example:
         qs3 view chair.ply other/chair.ply points=20000
-        qs3 view data/specklenet10 match=chair colour=class
+        qs3 view data/specklenet10 match=chair
         qs3 view logs/qs3_s2d/seed0-5f0c2a71 out=errors.html
     """
     from qs3.report.view import Wanted
@@ -124,7 +120,7 @@ def view(
     from qs3.utils.files import write_text
 
     wanted = Wanted(match, up, variant, data_dir, points)
-    text, about, failed = page([path, *paths], clouds, colour, wanted)
+    text, about, failed = page([path, *paths], clouds, wanted)
     write_text(out, text)
     print(*about, *(f"not read: {words}" for words in failed), sep="\n")
     print(f"saved {out}, {len(text) / 1e6:.2f} MB; open it in a browser")

@@ -35,7 +35,6 @@ AZIMUTHS, RINGS = 12, 6
 """Directions are counted in 12 x 6 bins of equal solid angle."""
 
 _COMPARED = 60  # clouds a class
-_SHEET, _ROW = 60, 6  # clouds of a class sheet, and in its rows
 _SIDE_PX, _POINTS = 376, 1024  # of a picture on a sheet
 _SPACED = ("nn_median", "nn_variation", "directions", "below")
 
@@ -82,10 +81,10 @@ def coverage(ball: Float[np.ndarray, "p 3"]) -> tuple[float, float]:
     return float(hit.mean()), float(hit[: RINGS // 3].mean())
 
 
-def measured(opened: Opened, sample: int, seed: int = 0) -> pd.DataFrame:
-    """A row for each of up to `sample` clouds, drawn with `seed`: id, class, split, `one_cloud`."""
+def measured(opened: Opened, sample: int) -> pd.DataFrame:
+    """A row for each of up to `sample` clouds, drawn at random: id, class, split, `one_cloud`."""
     data, rows = opened.data, []
-    some = drawn(np.arange(len(data)), sample, seed)
+    some = drawn(np.arange(len(data)), sample)
     with progress_bar(f"inspecting {opened.name}", total=len(some)) as advance:
         for i in some:
             name = "unlabelled" if data.labels[i] < 0 else data.classes[data.labels[i]]
@@ -163,8 +162,8 @@ def _shapes(clouds: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
-    """The gap between two datasets, by up to 60 clouds a class, drawn with `seed`."""
+def compare(a: Opened, b: Opened) -> dict[str, Any]:
+    """The gap between two datasets, by up to 60 clouds a class, drawn at random."""
     both = (a, b)
     common = [c for c in a.data.classes if all(len(one.data.members(c)) for one in both)]
     if not common:
@@ -178,7 +177,7 @@ def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
     for one in both:
         positions: list[int] = []
         for cls in common:
-            rng = np.random.default_rng([seed, 2, one.data.classes.index(cls)])
+            rng = np.random.default_rng([0, 2, one.data.classes.index(cls)])
             positions += rng.permutation(one.data.members(cls))[:_COMPARED].tolist()
         seen = []
         for i in positions:  # as a net sees them
@@ -194,7 +193,6 @@ def compare(a: Opened, b: Opened, seed: int = 0) -> dict[str, Any]:
         "made_of_a": str(a.made_of),
         "made_of_b": str(b.made_of),
         "points": count,
-        "seed": seed,
         "prior": (prior / prior.sum()).to_dict("index"),
         "cloud": clouds,
     }
@@ -252,7 +250,7 @@ def pair_text(facts: Mapping[str, Any]) -> str:
 
 
 def contact_sheet(
-    clouds: Sequence[np.ndarray | None], titles: Sequence[str], columns: int = _ROW, **words: Any
+    clouds: Sequence[np.ndarray | None], titles: Sequence[str], columns: int = 6, **words: Any
 ) -> Figure:
     """A sheet of clouds [P, 3], z up; `words` as of `qs3.utils.pictures.sheet`.
 
@@ -268,24 +266,6 @@ def contact_sheet(
         some = cloud[:: max(1, len(cloud) // _POINTS)]
         images.append(cloud_image(some, _SIDE_PX, AZIMUTH_DEG + turn_deg(cloud)))
     return sheet(images, titles, columns=columns, **words)
-
-
-def class_sheet(data: PointSet, split: str, heading: str = "") -> Figure:
-    """A sheet of up to 60 of a split's clouds, a class a row, drawn at random."""
-    part, columns = data.split(split), _ROW
-    rows: tuple[str, ...] = ()
-    shown: list[int | None] = []
-    if data.labelled:
-        columns = max(2, min(columns, _SHEET // len(part.classes)))
-        rows = tuple(cls for cls in part.classes if len(part.members(cls)))
-        for cls in rows:
-            some = drawn(part.members(cls), columns)
-            shown += [*some, *[None] * (columns - len(some))]
-    else:
-        shown += drawn(np.arange(len(part)), _SHEET)
-    clouds = [None if i is None else part.points[i] for i in shown]
-    titles = ["" if i is None else part.ids[i].rsplit("/", 1)[-1][-22:] for i in shown]
-    return contact_sheet(clouds, titles, columns, heading=heading, rows=rows)
 
 
 def scan_picture(domains: Mapping[str, PointSet], split: str) -> Figure:

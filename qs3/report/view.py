@@ -30,15 +30,13 @@ class Wanted(NamedTuple):
     points: int | None
 
 
-def view(
-    paths: Sequence[str], clouds: int, colour: str, wanted: Wanted
-) -> tuple[str, list[str], list[str]]:
+def view(paths: Sequence[str], clouds: int, wanted: Wanted) -> tuple[str, list[str], list[str]]:
     """The page, what is on it, and what could not be read, a line each."""
     share = max(1, clouds // len(paths))
     parts = [_part(path, share, wanted) for path in paths]
     title = ", ".join(Path(path).absolute().name for path in paths)
     failed = [words for part in parts for words in part.failed]
-    return page(title, parts, colour, wanted.points), [part.about for part in parts], failed
+    return page(title, parts, wanted.points), [part.about for part in parts], failed
 
 
 def _part(path: str, most: int, wanted: Wanted) -> Part:

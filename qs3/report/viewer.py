@@ -79,12 +79,11 @@ def thinned(one: Shown, most: int) -> Shown:
     return dataclasses.replace(one, points=one.points[drawn(np.arange(count), most)], of=count)
 
 
-def viewer(parts: Sequence[Part], colour: str = "", points: int | None = None) -> dict[str, Any]:
+def viewer(parts: Sequence[Part], points: int | None = None) -> dict[str, Any]:
     """What the viewer's template takes: "about" and "notes", lines each, and "data".
 
     Args:
         parts: of clouds, in order.
-        colour: which comes first of height, class and confidence, if it is known.
         points: of each cloud, at most; None: what keeps the page below a megabyte or so.
     """
     from matplotlib import colormaps
@@ -107,7 +106,6 @@ def viewer(parts: Sequence[Part], colour: str = "", points: int | None = None) -
         "clouds": [_cloud(thinned(one, most)) for one in whole],
         "start": {"azimuth": AZIMUTH_DEG, "elevation": ELEVATION_DEG},
         "modes": modes,
-        "colour": colour if colour in modes else modes[0],
         "classes": classes,
         "ramp": _bytes(colormaps["viridis"](np.linspace(0, 1, 16))),
         "class_colours": _bytes(distinct),
@@ -116,9 +114,9 @@ def viewer(parts: Sequence[Part], colour: str = "", points: int | None = None) -
     return {"about": about, "notes": [f"not read: {words}" for words in failed], "data": data}
 
 
-def page(title: str, parts: Sequence[Part], colour: str = "", points: int | None = None) -> str:
+def page(title: str, parts: Sequence[Part], points: int | None = None) -> str:
     """A page of clouds as HTML; see `viewer`."""
-    return render("clouds.html", title=title, **viewer(parts, colour, points))
+    return render("clouds.html", title=title, **viewer(parts, points))
 
 
 def _cloud(one: Shown) -> dict[str, Any]:

@@ -69,11 +69,10 @@ def test_names_stay_text():
 
 
 def test_colours_are_those_that_something_is_known_of():
-    assert data_of(of(one(), colour="class"))["modes"] == ["height"]
+    assert data_of(of(one()))["modes"] == ["height"]
     full = one(label="chair", called="sofa", sure=0.9)
-    found = data_of(of(one("b", label="bed"), full, colour="confidence"))
+    found = data_of(of(one("b", label="bed"), full))
     assert found["modes"] == ["height", "class", "confidence"]
-    assert found["colour"] == "confidence"
     assert found["classes"] == ["bed", "chair"]
     assert len(found["class_colours"]) == 2
 

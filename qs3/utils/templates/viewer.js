@@ -267,7 +267,6 @@
   list.append(new Option(all.length > 1 ? `all ${all.length} clouds` : "the cloud", -1));
   for (const { cloud, place } of all) list.append(new Option(cloud.name, place));
   for (const mode of page.modes) colour.append(new Option(mode, mode));
-  colour.value = page.colour;
   grid.append(...all.map((card) => card.box));
   for (const card of all) {
     listen(card);
