@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _Out = Annotated[str | None, "where the files go (default LOG_DIR/tables)"]
 _Seeds = Annotated[tuple[Annotated[int, Ge(0)], ...], "of each cell (default: the table's)"]
 _Jobs = Annotated[int | None, Ge(1), "runs at the same time"]
-_Launcher = Literal["basic", "joblib", "ray", "slurm", "submitit_local", "submitit_slurm"]
+_Launcher = Literal["joblib", "ray", "slurm"]
 
 
 def _built(
@@ -97,7 +97,7 @@ def train(
     seeds: _Seeds = (),
     rows: Annotated[tuple[str, ...], "only rows of this name, or with it in theirs"] = (),
     jobs: _Jobs = None,
-    launcher: Annotated[_Launcher | None, "of Hydra (default basic; joblib with jobs)"] = None,
+    launcher: Annotated[_Launcher | None, "of Hydra (default: joblib with jobs)"] = None,
     **settings: Annotated[str, "settings of the launcher, hydra.launcher.NAME"],
 ) -> int:
     """Train what a table lacks, seed by seed; called again it goes on.
@@ -111,7 +111,6 @@ def train(
     more, found = _words(settings, "hydra.launcher."), build()
     todo = missing(found, seeds, rows)
     print(f"table {found.name}: {len(todo)} runs to do", flush=True)
-    launcher = launcher or ("joblib" if (jobs or 1) > 1 else "basic")
     return launch(todo, launcher, jobs, found.log_dir, more)
 
 
@@ -220,7 +219,7 @@ def leaderboard(
     found = build(rows=[row])
     todo = missing(found, seeds, [row["name"]])
     print(f"{row['name']}: {len(todo)} runs to do", flush=True)
-    status = launch(todo, "joblib" if (jobs or 1) > 1 else "basic", jobs, found.log_dir)
+    status = launch(todo, None, jobs, found.log_dir)
     found = first_row(build(rows=[row]), row["name"])
     text = page(found, row["name"])
     place = _place(found, out, "".join(c if c.isalnum() else "-" for c in row["name"]))

@@ -11,10 +11,10 @@ import json
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from qs3.config.compose import composed, override
 from qs3.config.hydra import build, file_sha256
@@ -26,15 +26,8 @@ from qs3.report.formats import markdown
 from qs3.report.spec import chosen
 from qs3.report.table import Table, composed_of
 
-LAUNCHERS: Mapping[str, str | None] = {
-    "basic": None,
-    "joblib": "hydra.launcher.n_jobs",
-    "ray": "hydra.launcher.jobs",
-    "submitit_local": "hydra.sweeper.at_once",
-    "submitit_slurm": "hydra.launcher.array_parallelism",
-    "slurm": "hydra.launcher.array_parallelism",
-}
-"""Hydra's launchers, and the setting of each for how many jobs run at the same time, if any."""
+_AT_ONCE = {"joblib": "n_jobs", "ray": "jobs", "slurm": "array_parallelism"}
+"""Hydra's launchers, and the setting of each for how many jobs run at the same time."""
 
 ALONE = "experiment=leaderboard"
 WITH_ROUNDS = "protocol.epochs=10 protocol.steps=180"
@@ -72,19 +65,20 @@ def missing(table: Table, seeds: Sequence[int] = (), rows: Sequence[str] = ()) -
 
 def launch(
     jobs: Sequence[Job],
-    launcher: str,
+    launcher: Literal["joblib", "ray", "slurm"] | None,
     at_once: int | None,
     log_dir: str,
     settings: Sequence[str] = (),
 ) -> int:
     """Run jobs, in order, as one multirun of `train.py`; returns its exit status.
 
-    With one of `LAUNCHERS`, `at_once` at the same time (None: what it does by itself), and further
-    overrides of it. With submitit, what a job prints lies in `<log_dir>/.submitit`.
+    `at_once` at the same time (None: what the launcher does by itself); without a launcher one
+    after the other, or by joblib if several at once. With SLURM, what a job prints lies in
+    `<log_dir>/.submitit`. Further settings are of the launcher.
     """
     if not jobs:
         return 0
-    key = LAUNCHERS[launcher]
+    launcher = launcher or ("joblib" if (at_once or 1) > 1 else None)
     with tempfile.TemporaryDirectory(prefix="qs3-table-") as folder:
         file = Path(folder) / "jobs.json"
         file.write_text(json.dumps([job.overrides for job in jobs]), encoding="utf-8")
@@ -92,8 +86,8 @@ def launch(
             override("paths.log_dir", log_dir),
             "hydra/sweeper=listed",
             override("hydra.sweeper.file", file),
-            f"hydra/launcher={launcher}",
-            *([f"{key}={at_once}"] if key and at_once else []),
+            f"hydra/launcher={launcher or 'basic'}",
+            *([f"hydra.launcher.{_AT_ONCE[launcher]}={at_once}"] if launcher and at_once else []),
             *settings,
             "--multirun",
         ]

@@ -58,21 +58,17 @@ class ListedJobs(OverLauncher):
 
     Args:
         file: of the jobs.
-        at_once: so many are handed to the launcher, and waited for, before the next; None: all.
     """
 
-    def __init__(self, file: str, at_once: int | None = None) -> None:
+    def __init__(self, file: str) -> None:
         super().__init__()
-        self.file, self.at_once = Path(file), at_once
+        self.file = Path(file)
 
     def run(self, arguments: list[str]) -> list[JobReturn]:
         """Run them all, each with `arguments` as well; then raise the first error, if any."""
         listed: list[list[str]] = json.loads(self.file.read_text("utf-8"))
         jobs = [[*(word for word in arguments if word not in job), *job] for job in listed]
-        step = self.at_once or max(1, len(jobs))
-        done: list[JobReturn] = []
-        for first in range(0, len(jobs), step):
-            done += self.launch(jobs[first : first + step], first)
+        done = self.launch(jobs, 0)
         for job in done:
             _ = job.return_value  # raises if the job failed
         return done

@@ -61,14 +61,12 @@ def test_a_job_of_rays_whose_process_is_killed_begins_again(tmp_path):
 
 
 @pytest.mark.slow
-def test_listed_jobs_in_parts(tmp_path):
-    """Any jobs, numbered through; each part has to end before the next begins."""
+def test_listed_jobs(tmp_path):
+    """Any jobs, numbered through."""
     jobs = [["selftraining.theta=0.5"], ["seed=9"], ["method=dann", "seed=4"]]
     (tmp_path / "jobs.json").write_text(json.dumps(jobs))
     words = ["hydra/sweeper=listed", f"hydra.sweeper.file={tmp_path / 'jobs.json'}"]
-    result = light(
-        tmp_path, *words, "hydra.sweeper.at_once=1", "trainer=gpus_in_turn", "trainer.gpus=9"
-    )
+    result = light(tmp_path, *words, "trainer=gpus_in_turn", "trainer.gpus=9")
     assert result.returncode == 1
     assert "1 of 3 jobs failed" in result.stdout
     assert sorted(run["devices"] for run in light_runs(tmp_path).values()) == [[0], [2]]
