@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import trimboth
 
 from qs3.calibration.subject import POSE, Subject, box_of, quad
 from qs3.geometry.cameras import Intrinsics, Window
@@ -242,9 +243,7 @@ def median(values: np.ndarray) -> float:
 
 def _spread(values: np.ndarray) -> float:
     """Standard deviation without the lowest and the highest 0.5 %; NaN of nothing."""
-    values = np.sort(values[np.isfinite(values)], axis=None)
-    cut = int(len(values) * _TRIM)
-    kept = values[cut : len(values) - cut]
+    kept = trimboth(values[np.isfinite(values)], _TRIM)
     return float(np.std(kept)) if kept.size else np.nan
 
 

@@ -71,8 +71,10 @@ def expected_accuracy(
     if known is None or len(probabilities) < FEWEST or not np.isfinite(probabilities).all():
         return None
     sure = float(scaled(probabilities, known.temperature).max(axis=1).mean())
-    base = _logit(known.accuracy)
-    return 1 / (1 + math.exp(WEIGHT * max(0.0, base - _logit(sure)) - base))
+    from scipy.special import expit, logit  # slow to import, and a command prints `in_words`
+
+    base, here = logit(np.clip([known.accuracy, sure], _EDGE, 1 - _EDGE))
+    return float(expit(base - WEIGHT * max(0.0, base - here)))
 
 
 def in_words(expected: float | None) -> str:
@@ -93,7 +95,7 @@ def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray,
     weights = np.full(probabilities.shape, rest / max(1, classes - 1))
     weights[np.arange(len(labels)), labels] = 1 - rest
 
-    from scipy.optimize import minimize_scalar  # slow to import, and a command prints `in_words`
+    from scipy.optimize import minimize_scalar
 
     def loss(log_t: float) -> float:
         logs = np.log(np.maximum(scaled(probabilities, math.exp(log_t)), _TINY))
@@ -107,15 +109,9 @@ def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray,
 
 def scaled(probabilities: Float[np.ndarray, "n c"], t: float) -> Float[np.ndarray, "n c"]:
     """softmax(log p / t)."""
-    logits = np.log(np.maximum(probabilities, _TINY)) / t
-    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
-    return weights / weights.sum(axis=1, keepdims=True)
+    from scipy.special import softmax
 
-
-def _logit(share: float) -> float:
-    """ln(p / (1 - p)) of p clipped to [0.02, 0.98]."""
-    p = min(1 - _EDGE, max(_EDGE, share))
-    return math.log(p / (1 - p))
+    return np.asarray(softmax(np.log(np.maximum(probabilities, _TINY)) / t, axis=1))
 
 
 ESTIMATED = "estimated"

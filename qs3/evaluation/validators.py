@@ -1,4 +1,4 @@
-"""Scores of an epoch without the target's labels, and which epoch is reported (numpy only).
+"""Scores of an epoch without the target's labels, and which epoch is reported.
 
 Rules of `selection.student`, by name:
 
@@ -41,7 +41,9 @@ def entropy(probabilities: Float[np.ndarray, "n k"]) -> float:
     Morerio et al., "Minimal-Entropy Correlation Alignment for Unsupervised Deep Domain
     Adaptation", ICLR 2018, chooses a hyper-parameter by it.
     """
-    return float(entropies(probabilities).mean())
+    from scipy.special import entr  # late: train.py imports this module before it knows its data
+
+    return float(entr(probabilities).sum(axis=1).mean())
 
 
 def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
@@ -55,7 +57,7 @@ def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
     it is called IM.
     """
     mean = probabilities.mean(axis=0, keepdims=True)
-    value = entropies(mean)[0] - entropy(probabilities)  # < 0 by rounding alone
+    value = entropy(mean) - entropy(probabilities)  # < 0 by rounding alone
     return float(np.maximum(0.0, value))  # max() of Python's would make 0 of NaN
 
 
@@ -77,19 +79,16 @@ def snd(
         temperature: τ > 0.
         block: rows of the similarities that are in memory at once.
     """
+    from scipy.special import entr, softmax
+
     n = len(probabilities)
     assert n > 1
     directions = probabilities / np.linalg.norm(probabilities, axis=1, keepdims=True)  # [n, K]
     total = 0.0
-    for first in range(0, n, block):
-        rows = np.arange(min(block, n - first))
-        logits = directions[first : first + block] @ directions.T / temperature  # [b, n]
-        logits[rows, first + rows] = -np.inf
-        logits -= logits.max(axis=1, keepdims=True)
-        weights = np.exp(logits)
-        logits[rows, first + rows] = 0.0  # its weight is 0, but 0 times -inf is not
-        sums = weights.sum(axis=1)
-        total += (np.log(sums) - np.einsum("bn,bn->b", weights, logits) / sums).sum()
+    for rows in np.array_split(np.arange(n), -(-n // block)):
+        logits = directions[rows] @ directions.T / temperature  # [b, n]
+        logits[np.arange(len(rows)), rows] = -np.inf
+        total += entr(softmax(logits, axis=1)).sum()
     return float(np.clip(total / n, 0.0, math.log(n - 1)))
 
 
@@ -145,12 +144,6 @@ def hold_out(
         count = (len(members) + _HELD_OUT // 2) // _HELD_OUT
         held[rng.permutation(members)[:count]] = True
     return held
-
-
-def entropies(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
-    """H(p_i) = -Σ_k p_k ln p_k of each row, in nats; 0 ln 0 = 0."""
-    logs = np.log(np.where(probabilities > 0, probabilities, 1.0))
-    return -(probabilities * logs).sum(axis=1)
 
 
 def chosen_in_words(chosen: str) -> str:
