@@ -29,9 +29,5 @@ class RenderError(Qs3Error):
     """A renderer cannot be used here, or failed."""
 
 
-class ClusterError(Qs3Error):
-    """Other machines that work for this one cannot go on."""
-
-
 class SelectionError(Qs3Error):
     """A round of self-training selected too little to train on."""

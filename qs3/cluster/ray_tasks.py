@@ -2,40 +2,29 @@
 
 Each task is a task of Ray Core: where it runs is Ray's decision, nodes may come and go, and what
 it returns comes back through Ray's object store, so nodes need no disk in common. Retries are
-counted here and not by Ray, because who ended the process matters: a task that does so several
-times is given up, one whose node was lost is not to blame.
+counted here and not by Ray, which begins a task that was out of memory again for ever.
 """
 
 import logging
 import math
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from types import ModuleType
 from typing import Annotated, Any
 
 from annotated_types import Ge, Gt
 
-from qs3.errors import ClusterError, ConfigError
+from qs3.errors import ConfigError
 from qs3.utils.pool import Maker, Outcome, Outcomes, Result, Task, Tasks
 from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
 _POLL_S = 1.0
-_LOST_NODES = 10  # with one task: more is no accident
-
-
-@dataclass
-class _Work:
-    """A task on its way: how often its process ended, and how often its node was lost."""
-
-    name: str
-    task: Any
-    deaths: int = 0
-    lost: int = 0
 
 
 @settings
@@ -50,7 +39,7 @@ class RayTasks:
         cpus, gpus: cores and graphics cards that a task takes; a card may be shared: 0.25.
         memory_gb: that a task asks for, so that a node takes no more of them than fit; None: not
             said.
-        attempts: a task that has ended its process so often is given up.
+        attempts: a task whose process has ended, or whose node was lost, so often is given up.
         tasks_per_process: after so many a process is replaced.
         shared_disk: all nodes see the files of this machine under the same paths, so that workers
             read meshes and write results themselves; else they are sent.
@@ -100,9 +89,10 @@ class RayTasks:
             )(_do)
             # The key is of this run: a process of Ray may have served another one.
             maker, key = ray.put(make_worker), os.urandom(16)
-            waiting = (_Work(name, task) for name, task in tasks)
-            pending: dict[Any, _Work] = {}
-            again: list[_Work] = []
+            waiting = iter(tasks)
+            pending: dict[Any, tuple[str, Any]] = {}
+            again: list[tuple[str, Any]] = []
+            deaths: Counter[str] = Counter()
             try:
                 while True:
                     # Twice as many as can run: a free core need not wait for this process.
@@ -110,13 +100,13 @@ class RayTasks:
                         work = again.pop() if again else next(waiting, None)
                         if work is None:
                             break
-                        pending[remote.remote(maker, key, work.task)] = work
+                        pending[remote.remote(maker, key, work[1])] = work
                     if not pending:
                         return
                     ready, _ = ray.wait(list(pending), timeout=_POLL_S)
                     for ref in ready:
                         work = pending.pop(ref)
-                        if (outcome := self._outcome(ray, ref, work)) is not None:
+                        if (outcome := self._outcome(ray, ref, work[0], deaths)) is not None:
                             yield outcome
                         else:
                             again.append(work)
@@ -125,25 +115,22 @@ class RayTasks:
                     with suppress(Exception):  # it has ended by now, or the cluster is gone
                         ray.cancel(ref, force=True)
 
-    def _outcome(self, ray: ModuleType, ref: Any, work: _Work) -> Outcome[Any] | None:
+    def _outcome(
+        self, ray: ModuleType, ref: Any, name: str, deaths: Counter[str]
+    ) -> Outcome[Any] | None:
         """What became of a task; None if it is to be done again."""
         errors = ray.exceptions
         try:
-            return Outcome(work.name, ray.get(ref))
+            return Outcome(name, ray.get(ref))
         except errors.RayTaskError as error:  # the worker's own error ends everything
             raise error.cause if isinstance(error.cause, Exception) else error from error
-        except (errors.NodeDiedError, errors.ObjectLostError, errors.OwnerDiedError) as error:
-            work.lost += 1
-            log.warning("%s: a node was lost (%s)", work.name, type(error).__name__)
-        except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
-            work.deaths += 1
-            log.warning("%s: its process ended (%s)", work.name, type(error).__name__)
-        except errors.RayError as error:
-            raise ClusterError(
-                f"Ray ended the run at {work.name} ({error}); run the same command again"
-            ) from error
-        given_up = work.lost >= _LOST_NODES or work.deaths >= self.attempts
-        return Outcome(work.name, None, died=True) if given_up else None
+        except (
+            errors.NodeDiedError, errors.ObjectLostError, errors.OwnerDiedError,
+            errors.WorkerCrashedError, errors.OutOfMemoryError,
+        ) as error:  # fmt: skip
+            log.warning("%s: its process or node is gone (%s)", name, type(error).__name__)
+        deaths[name] += 1
+        return Outcome(name, None, died=True) if deaths[name] >= self.attempts else None
 
 
 _WORKERS: dict[bytes, Any] = {}
