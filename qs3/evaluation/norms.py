@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.distributions import Categorical
 
 from qs3.kernels.norms import adapt_batchnorm, check_has_norms, running_norms, use_trained
 
@@ -48,12 +49,6 @@ def _even_batches(
         yield points[index]
 
 
-def entropy(logits: Float[Tensor, "b c"]) -> Float[Tensor, ""]:
-    """Mean Shannon entropy of the predictions in nats, in [0, ln C]."""
-    logs = logits.log_softmax(dim=1)
-    return -(logs.exp() * logs).sum(dim=1).mean()
-
-
 def minimise_entropy(
     net: nn.Module,
     points: Float[Tensor, "n p 3"],
@@ -82,7 +77,8 @@ def minimise_entropy(
             optimizer = torch.optim.Adam(affine, RATE)
             for batch in _even_batches(points, batch_size, seed):
                 optimizer.zero_grad()
-                entropy(net(batch.to(device))).backward()
+                logits = net(batch.to(device))
+                Categorical(logits=logits, validate_args=False).entropy().mean().backward()
                 optimizer.step()
     finally:
         for parameter, want in zip(parameters, wanted, strict=True):
