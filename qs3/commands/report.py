@@ -252,7 +252,7 @@ def pipeline(
     domain: Annotated[str, "of conf/domain"],
     object: Annotated[str | None, "its id (default: a chair)"] = None,
     mesh: Annotated[Path | None, "a mesh file to scan in place of the domain's objects"] = None,
-    view: Annotated[int, "whose images are shown"] = 0,
+    view: Annotated[int, Ge(0), "whose images are shown"] = 0,
     out: Annotated[Path, "the picture"] = Path("pipeline.png"),
     **overrides: Annotated[str, "of generate.py, such as sensor=kinect_v1"],
 ) -> None:

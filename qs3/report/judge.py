@@ -18,7 +18,7 @@ from qs3.classes import known_as
 from qs3.datasets.object_archive import JUDGE, TIERS, read_archive
 from qs3.errors import ConfigError
 from qs3.inference.model_file import FILE, find_result, pretrained_name
-from qs3.inference.predictor import Predictor, load
+from qs3.inference.predictor import load
 from qs3.report.intervals import Interval, difference, share
 from qs3.runs.metrics import read_metrics
 from qs3.utils.progress import progress_bar
@@ -83,7 +83,10 @@ def judge(
     part = part or (JUDGE if JUDGE in archive.parts else "")
     chosen = archive.of_part(part) if part else list(range(len(archive)))
     families = _families(find_runs(runs))
-    nets = {file: _load(file, floor, device) for one in families for file in one.runs.values()}
+    nets = {file: load(file, device=device) for one in families for file in one.runs.values()}
+    for file, net in nets.items():
+        if net.result.gravity != "z":
+            raise ConfigError(f"{file} was trained on clouds in their camera's frame, not z up")
     first = next(iter(nets.values())).classes
     common = tuple(name for name in first if all(name in net.classes for net in nets.values()))
     names = [known_as(str(name), common) for name in archive.cls]
@@ -118,16 +121,6 @@ def judge(
     others = len(chosen) - len(kept)
     about = f"{data}{f', part {part}' * bool(part)}: real objects without stray points; "
     return Verdict(f"{about}{others} objects of other classes left out", common, pd.DataFrame(rows))
-
-
-def _load(file: Path, floor: float | None, device: str) -> Predictor:
-    """The classifier of a run, for clouds with z up and, if it knows heights, a known floor."""
-    net = load(file, device=device)
-    if net.result.gravity != "z":
-        raise ConfigError(f"{file} was trained on clouds in the frame of their camera, not z up")
-    if net.needs_floor and net.camera_height is None and floor is None:
-        raise ConfigError(f"{file} knows heights above the floor; give floor=-CAMERA_HEIGHT")
-    return net
 
 
 def find_runs(runs: Sequence[str]) -> list[Path]:

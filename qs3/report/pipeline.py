@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from qs3.errors import ConfigError
 from qs3.generation.kept import Keep, view_images
 from qs3.generation.plan import planned
 from qs3.geometry.sampling import surface_sample
@@ -116,8 +115,6 @@ def scan_object(
     else:
         items = {item.id: item for item in planned(cfg).items}
         name = object_id or (_OFTEN_THERE if _OFTEN_THERE in items else next(iter(items)))
-        if name not in items:
-            raise ConfigError(f"object={name} is not in the domain; it has {next(iter(items))}")
         item = items[name]
     loaded, looks = item.load(), recipe.needs_renderer
     views: list[View] = []
@@ -135,8 +132,6 @@ def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
     """Draw every stage of one object; its images are those of a view."""
     pictures, words = cloud_images(one), f"{one.name}, {one.domain}"
     if one.views:
-        if view >= len(one.views):
-            raise ConfigError(f"view={view}: {one.name} has {len(one.views)} views")
         words += f", view {view} of {len(one.views)}"
         pictures = [*view_images(one.views[view].frame), *pictures]
     titles, images = zip(*pictures, strict=True)

@@ -110,7 +110,7 @@ def test_runs_of_other_classes_and_of_heights(archive, logs, tmp_path):
     low, high = (judge([str(standing)], archive, floor=floor) for floor in (-1.2, -25.0))
     assert not low.figures.drop(columns="alone").equals(high.figures.drop(columns="alone"))
     camera = add_net(tmp_path, 3, gravity="none")
-    with pytest.raises(ConfigError, match="frame of their camera"):
+    with pytest.raises(ConfigError, match="their camera's frame"):
         judge([str(camera)], archive)
 
 

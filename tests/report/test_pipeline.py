@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.errors import ConfigError
 from qs3.report.pipeline import pipeline_figure, scan_object
 from tests.report.made_runs import not_blank
 from tests.running import main
@@ -42,8 +41,6 @@ def test_the_figure_of_two_cameras(speckle):
     images = ("view 1", "infrared, right", "disparity", "depth, ", "ok ")
     for stage in (*images, "cloud: 2 views fused", "clean twin", "distance to the mesh"):
         assert stage in told
-    with pytest.raises(ConfigError):
-        pipeline_figure(speckle, view=2)
 
 
 @pytest.mark.slow
@@ -60,11 +57,9 @@ def test_surface_samples_are_a_cloud_and_nothing_else():
     assert one.residual_m.max() < 5e-3
 
 
-def test_command_with_a_mesh_of_ones_own(tmp_path, capsys):
+def test_command_with_a_mesh_of_ones_own(tmp_path):
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.ply")
     out = tmp_path / "p.png"
     asked = ["report", "pipeline", "domain=modelnet10", f"out={out}"]
     assert main([*asked, f"mesh={tmp_path / 'box.ply'}"]) == 0
     assert not_blank(out)
-    assert main([*asked, "object=nothing"]) == 1
-    assert "ConfigError: object=nothing" in capsys.readouterr().err
