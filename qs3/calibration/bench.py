@@ -33,12 +33,6 @@ DEFAULT_SENSORS = (
 )  # fmt: skip
 """On the page. Not on it: copies of others, and those that repeat a defect on purpose."""
 
-PLANES = (
-    "sensor", "depth_m", "tilt_deg", "recedes", "pixels", "fill", "sigma_m", "bias_m", "accuracy",
-    "subpixel_rms_px", "bias_px", "correlation_px",
-)  # fmt: skip
-"""Columns of planes.csv; see `planes.measure`."""
-
 _TILTS_DEG = (15, 30, 45, 60, 65, 70, 75, 80, 85)
 _SHOWN_M = (0.5, 1.0, 2.0, 3.0, 4.0)
 _SHOWN_DEG = (60.0, 75.0, 80.0, 85.0)
@@ -89,7 +83,7 @@ def run(
     jobs = [(subject, each) for subject in subjects for each in conditions(subject, quick)]
     rows = [planes.measure(s, renderer, *each) for s, each in shown(jobs, "planes")]
     squares = [edges.measure(s, renderer, 3 if quick else 8) for s in shown(subjects, "edges")]
-    return write(subjects, pd.DataFrame(rows, columns=PLANES), pd.DataFrame(squares), folder)
+    return write(subjects, pd.DataFrame(rows), pd.DataFrame(squares), folder)
 
 
 def write(

@@ -36,18 +36,15 @@ class Subject:
     name: str
     sensor: DepthSensor
 
-    def _get(self, key: str, default: Any = None) -> Any:
-        return getattr(self.sensor, key, default)
-
     @property
     def step_px(self) -> int:
         """Spacing of depth samples in pixels of the camera."""
-        return int(self._get("step_px", 1))
+        return int(getattr(self.sensor, "step_px", 1))
 
     @property
     def baseline_m(self) -> float | None:
         """None for a sensor that does not triangulate."""
-        value = self._get("baseline_m")
+        value = getattr(self.sensor, "baseline_m", None)
         return None if value is None else float(value)
 
     @property
@@ -58,7 +55,7 @@ class Subject:
     @property
     def matcher(self) -> Any:
         """Its matcher; None where nothing is matched."""
-        return self._get("matcher")
+        return getattr(self.sensor, "matcher", None)
 
     @property
     def window_px(self) -> int | None:
@@ -74,8 +71,9 @@ class Subject:
 
     def depths_m(self) -> list[float]:
         """Depths within its range, with room for the spread of a condition."""
-        low = self._get("min_depth_m", 0.2)
-        high = self._get("max_depth_m", self._get("max_distance_m", 6.0))
+        low = getattr(self.sensor, "min_depth_m", 0.2)
+        farthest_m = getattr(self.sensor, "max_distance_m", 6.0)
+        high = getattr(self.sensor, "max_depth_m", farthest_m)
         fb = None if self.focal_baseline is None else abs(self.focal_baseline)  # to either side
         out = []
         for depth in _DEPTHS_M:

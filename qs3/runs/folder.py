@@ -19,7 +19,6 @@ written last, and atomically: it is the mark of a finished run.
         pictures/            of the above, drawn last; see `qs3.report.run_page`
 """
 
-import contextlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -45,13 +44,6 @@ def read_started(folder: str | Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise DataError(f"{path} cannot be read ({error}); run with force=true") from error
-
-
-def read_code(folder: str | Path) -> dict[str, str]:
-    """Hashes of the code that a run was begun with, by name; {} where it is not known."""
-    with contextlib.suppress(DataError):
-        return dict((read_started(folder) or {}).get("files") or {})
-    return {}
 
 
 def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:

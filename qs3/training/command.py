@@ -13,7 +13,7 @@ from qs3.config.hydra import build
 from qs3.datasets.domain import check_or_make
 from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
-from qs3.runs.folder import read_code
+from qs3.runs.folder import read_started
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
 from qs3.training.provenance import changed_files, refuse_changed
@@ -43,7 +43,7 @@ def train(cfg: DictConfig) -> RunMetrics:
                 build(cfg.report)(run.folder, OmegaConf.to_container(cfg, resolve=False))
         else:
             refuse_changed(run, metrics)
-            edited = " and ".join(changed_files(read_code(run.folder)))
+            edited = " and ".join(changed_files((read_started(run.folder) or {}).get("files", {})))
             edited = f", before an edit of {edited}" if edited else ""
             log.info("already finished%s (force=true repeats it)", edited)
     log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))

@@ -109,9 +109,7 @@ def test_a_preset_holds_its_bands(name):
     subject, renderer = load(name), MitsubaRenderer(samples=16)
     places = [(1.0, 0, True), (2.0, 0, True), (4.0, 0, True), (2.0, 45, True), (2.0, 45, False)]
     rows = [planes.measure(subject, renderer, *place, half_px=20) for place in places]
-    found = judge(
-        subject, pd.DataFrame(rows, columns=bench.PLANES), edges.measure(subject, renderer, 2)
-    )
+    found = judge(subject, pd.DataFrame(rows), edges.measure(subject, renderer, 2))
     assert [b for b in failures(found) if "at 1.5 m" not in b and "at 3 m" not in b] == []
     assert len(found) >= 5
 
@@ -124,7 +122,7 @@ def test_a_sensor_that_is_too_noisy_fails_its_bands(renderer):
     edge["projector_left_px"], edge["projector_right_px"] = (
         edge["projector_right_px"], edge["projector_left_px"],
     )  # fmt: skip
-    failed = " ".join(failures(judge(subject, pd.DataFrame(rows, columns=bench.PLANES), edge)))
+    failed = " ".join(failures(judge(subject, pd.DataFrame(rows), edge)))
     assert "over Nguyen's" in failed
     assert "projector shadow" in failed
 
@@ -143,7 +141,6 @@ def test_a_fitted_preset_is_held_against_what_it_states(renderer, baseline_m):
             planes.measure(subject, renderer, *place, phases=8, half_px=20)
             for place in ((0.5, 0.0), (2.0, 0.0), (2.0, 45.0))
         ],
-        columns=bench.PLANES,
     )
     edge = edges.measure(subject, renderer, 1)
     found = judge(subject, rows, edge)
