@@ -207,9 +207,9 @@ class Stat:
         return Stat(float(values.mean()), sem, len(values))
 
     def percent(self) -> str:
-        """Such as "64.0 ± 1.0"; without a SEM for a single seed."""
+        """Such as "64.0 ± 1.0"; of few seeds with their number, "64.0 (n=1)"."""
         sem = "" if self.sem is None else f" ± {100 * self.sem:.1f}"
-        return f"{100 * self.mean:.1f}{sem}"
+        return f"{100 * self.mean:.1f}{sem}{f' (n={self.n})' * (self.n < FEW_SEEDS)}"
 
 
 class Runs:
@@ -291,13 +291,12 @@ def summarise(folders: Sequence[Path], settings: Mapping[Path, str] | None = Non
         for words, name in zip(("accuracy", "balanced", "majority"), _NAMES, strict=True):
             if stat := runs.stat(name):
                 row[words] = f"{100 * stat.mean:.1f}" if words == "majority" else stat.percent()
-        row["seeds"] = f"{len(runs.seeds)}{' (!)' * (0 < len(runs.seeds) < FEW_SEEDS)}"
+        row["seeds"] = str(len(runs.seeds))
         rows.append(row)
         notes += [f"{' '.join(key)}, {words}" for words in runs.problems]
     header = ["experiment", "settings", "source -> target", "method", "self-training"]
     header += ["accuracy", "balanced", "seeds", "majority"]
     table = [header, *([row.get(name, "-") for name in header] for row in rows)]
-    notes += [f"(!) fewer than {FEW_SEEDS} seeds"] * any("(!)" in row["seeds"] for row in rows)
     notes += data_lines(lines[lines.problem == ""])
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
     return "\n".join([caption, *aligned(table), *notes])

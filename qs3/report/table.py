@@ -19,7 +19,6 @@ from qs3.config.compose import composed, override
 from qs3.config.location import typed
 from qs3.errors import ConfigError, DataError
 from qs3.report.results import (
-    FEW_SEEDS,
     NO_RUNS,
     Runs,
     Stat,
@@ -60,7 +59,7 @@ class Cell:
         """What the table shows: the number, or why there is none."""
         done, mark = self.runs.finished, f" {INCOMPLETE}" * bool(self.runs.problems)
         if stat := self.runs.stat(metric):
-            return number(stat) + mark
+            return stat.percent() + mark
         if done.empty:
             return f"not finished{mark}" if mark else "not run" * bool(self.overrides)
         if not done.labelled.any():
@@ -110,12 +109,7 @@ class Table:
         if not (by_seed.size() == len(cells)).all():
             return ""
         mark = f" {INCOMPLETE}" * any(cell.runs.problems for cell in cells)
-        return number(Stat.of(by_seed.mean())) + mark
-
-
-def number(stat: Stat) -> str:
-    """The number; of few seeds with how many they are."""
-    return stat.percent() + f" (n={stat.n})" * (stat.n < FEW_SEEDS)
+        return Stat.of(by_seed.mean()).percent() + mark
 
 
 def build_table(

@@ -119,10 +119,8 @@ def test_summary_of_a_multirun(tmp_path):
     for part in ("theta=0.5", "(simulated target)", "pcm", "qbst", "64.0 ± 1.2", "54.0 ± 1.2"):
         assert part in lines[3]
     assert lines[3].endswith("  45.0")  # a property of the data: no SEM
-    assert "1 (!)" in lines[4]
     assert lines[5] == "exp ff00: no target labels, so no accuracy"
     assert lines[6] == f"exp ff00, seed 1: unfinished ({tmp_path / 'exp' / 'seed1-ff00'})"
-    assert lines[7] == "(!) fewer than 3 seeds"
 
 
 def test_a_kept_file_that_cannot_be_read(tmp_path):
