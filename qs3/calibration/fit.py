@@ -87,8 +87,6 @@ def plot_noise(noise: Noise, path: Path) -> None:
     axes.plot(noise.depth_m, 1e3 * noise.sigma_m, "o", ms=4, label="data")
     law_m = noise.floor_m + noise.factor * z**noise.power
     axes.plot(z, 1e3 * law_m, label="fitted law, without the steps")
-    nguyen = 0.0012 + 0.0019 * (z - 0.4) ** 2
-    axes.plot(z, 1e3 * nguyen, ":", color="grey", label="Kinect v1 (Nguyen 2012)")
     axes.set(xlabel="distance (m)", ylabel="noise (mm)", ylim=(0, None))
     axes.legend(fontsize=8)
     save_png(figure, path)

@@ -31,7 +31,7 @@ import pandas as pd
 from jaxtyping import Int
 
 from qs3.datasets.object_archive import TIERS
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE, read_predictions
 from qs3.utils.files import write_bytes
@@ -144,8 +144,6 @@ def read_kept(path: str | Path, target: str | None = None) -> dict[tuple[str, st
         lines = lines.assign(**{name: lines[name].astype(str) == "True" for name in _FLAGS})
         lines = lines if target is None else lines[lines.target == target]
         return dict(iter(lines.groupby(["row", "column"], sort=False)))
-    except FileNotFoundError as error:
-        raise ConfigError(f"kept={path} is not there; `qs3 report keep` writes it") from error
     except (OSError, ValueError, KeyError, AttributeError) as error:
         raise DataError(f"{path} cannot be read ({error})") from error
 

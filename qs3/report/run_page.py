@@ -172,19 +172,20 @@ def draw(
     except Qs3Error as error:  # damaged data cost their pictures alone
         skipped["clouds"] = str(error)
     m = run.metrics
-    rounds = pseudo_labels(m.rounds, run.classes) if m and m.rounds else None
+    rounds = confusion = None
+    if m and m.rounds:
+        table = pseudo_labels(m.rounds, run.classes)
+        rounds = table.to_html(border=0, float_format="{:.2f}".format, na_rep="")
+    if m and m.final.confusion:
+        confusion = confusion_rows(np.array(m.final.confusion), run.classes)
     page = render(
         "run.html",
         title=run.title,
         m=m,
         in_words=in_words,
         chosen_in_words=chosen_in_words,
-        confusion=m
-        and m.final.confusion
-        and confusion_rows(np.array(m.final.confusion), run.classes),
-        rounds=""
-        if rounds is None
-        else rounds.to_html(border=0, float_format="{:.2f}".format, na_rep=""),
+        confusion=confusion,
+        rounds=rounds,
         command=run.command,
         pictures=[(name, path.read_bytes()) for name, path in pictures.items()],
         skipped=skipped,

@@ -19,7 +19,6 @@ from annotated_types import Ge, Interval, MinLen
 from pydantic import ConfigDict, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from qs3.config.compose import choices
 from qs3.config.location import CONF
 from qs3.errors import ConfigError
 
@@ -121,10 +120,7 @@ def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[s
         spec = TypeAdapter(Spec).validate_python(plain)
         if twice := [name for name, n in Counter(r.name for r in spec.rows).items() if n > 1]:
             raise ValueError(f"two rows are called {twice[0]!r}")
-    except FileNotFoundError as error:
-        known = ", ".join(choices("table"))
-        raise ConfigError(f"there is no table {name!r}; there are {known}; or NAME.yaml") from error
-    except (yaml.YAMLError, TypeError, KeyError, ValueError, AttributeError) as error:
+    except (OSError, yaml.YAMLError, TypeError, KeyError, ValueError, AttributeError) as error:
         raise ConfigError(f"{path}: missing or wrong entry: {error}") from error
     return path.stem, spec
 

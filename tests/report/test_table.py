@@ -104,7 +104,7 @@ def test_what_is_asked_wrongly(own, tmp_path):
     ):  # fmt: skip
         with pytest.raises(ConfigError):
             own(**given)
-    with pytest.raises(ConfigError, match="quickstart"):
+    with pytest.raises(ConfigError, match="no_such_table"):
         build_table("no_such_table", tmp_path)
 
 
