@@ -11,8 +11,8 @@ import numpy as np
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
-from qs3.datamodules.augment import Augment, augmented
-from qs3.datamodules.batches import Batches, Piece
+from qs3.datamodules.augment import Augment
+from qs3.datamodules.batches import Batches, Piece, generator_of
 from qs3.datamodules.clouds import Clouds, Labelled
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
@@ -34,7 +34,6 @@ class AdaptationData(LightningDataModule):
         owner: whose labels are trained on: "source", or "target_train" for the upper bound
             (`method=supervised`), which alone asks for them.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
-        again: whether they hold a second draw of each source cloud.
         make_source: a generated source that is not there is made first.
         val, sampler, clouds_a_class: of the labelled domain, see `DomainData`. "balanced" is for
             the source alone: to balance the target's classes takes its true labels.
@@ -58,7 +57,6 @@ class AdaptationData(LightningDataModule):
         seed: int,
         owner: str = "source",
         uses_target: bool = False,
-        again: bool = False,
         make_source: bool = False,
         val: str = "lineage",
         sampler: str = "shuffled",
@@ -72,7 +70,7 @@ class AdaptationData(LightningDataModule):
         shown: dict[str, Any] = {"sampler": sampler, "clouds_a_class": clouds_a_class}
         self.labelled_domain = DomainData(labelled, val=val, **shown, **shared)
         self.target_domain = DomainData(target, labels=False, **shared)
-        self.owner, self.uses_target, self.again = owner, uses_target, again
+        self.owner, self.uses_target = owner, uses_target
         self.phases, self.scheme, self.augment = phases, scheme, augment
         self.scale = self.target_domain.scale
         self.eval_batch_size = self.target_domain.eval_batch_size
@@ -132,8 +130,7 @@ class AdaptationData(LightningDataModule):
             index, labels = self.pseudo
             parts["target"] = Labelled(self.target.at(index.numpy()), labels, "y_pseudo")
         if warmup or self.scheme.use_source:
-            owner, again = f"y_{self.owner}", self.again and warmup
-            parts["source"] = replace(self.labelled, owner=owner, again=again)
+            parts["source"] = replace(self.labelled, owner=f"y_{self.owner}")
         if warmup and self.uses_target:
             parts["target"] = self.target
         steps = self.phases.steps(epoch)
@@ -173,9 +170,9 @@ class AdaptationData(LightningDataModule):
         rank, result = self.trainer.global_rank, dict(batch)
         for name, part in batch.items():
             if isinstance(part, dict):
-                result[name] = augmented(
-                    self.augment, part, batch, name, self.seed, rank, self.scale
-                )
+                chance = generator_of(batch, name, self.seed, rank, part["points"].device)
+                moved = self.augment(part["points"], chance, self.scale)
+                result[name] = {**part, "points": moved}
         return result
 
     def state_dict(self) -> dict[str, Any]:

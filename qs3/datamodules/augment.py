@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from annotated_types import Ge, Interval
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.datamodules.batches import generator_of
 from qs3.utils.settings import settings
-
-Moves = Callable[[Float[Tensor, "b n 3"]], Float[Tensor, "b n 3"]]
-"""Turns, scales, shifts and lifts each of B clouds as a whole."""
 
 REGION_SHARE = (0.1, 0.25)
 """The smallest and largest share of a cloud's points that a dropped region takes."""
@@ -54,81 +49,38 @@ class Augment:
         points: Float[Tensor, "b n 3"],
         generator: torch.Generator,
         scale: str = "unit_ball",
-        moves: Moves | None = None,
-    ) -> tuple[Float[Tensor, "b n 3"], Moves]:
-        """A new batch, and how its clouds were moved; cut, holes and jitter are its own.
+    ) -> Float[Tensor, "b n 3"]:
+        """A new batch.
 
         Args:
             points: clouds as `scale` says.
             generator: on the device of `points`.
             scale: see `qs3.datamodules.clouds`; they are so again after a cut.
-            moves: those of other clouds of the same objects; None draws new ones.
         """
-        if self.crop < 1.0:
-            points = crop(points, self.crop, generator, scale)
-        if self.drop_regions:
-            points = drop_regions(points, self.drop_regions, generator)
-        moves = moves or self._drawn_moves(points, generator, scale)
-        points = moves(points)
-        if self.jitter_sigma > 0.0:
-            noise = torch.randn(points.shape, generator=generator, device=points.device)
-            noise = (self.jitter_sigma * noise).clamp(-self.jitter_clip, self.jitter_clip)
-            points = points + noise.to(points.dtype)
-        return points, moves
-
-    def _drawn_moves(self, points: Tensor, generator: torch.Generator, scale: str) -> Moves:
         b, like = len(points), {"device": points.device, "dtype": points.dtype}
 
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
 
-        angle = factor = None
-        added: list[Tensor] = []
+        if self.crop < 1.0:
+            points = crop(points, self.crop, generator, scale)
+        if self.drop_regions:
+            points = drop_regions(points, self.drop_regions, generator)
         if self.rotate_z:
-            angle = 2 * math.pi * uniform(b)
+            points = rotate_z(points, 2 * math.pi * uniform(b))
         if self.scale > 1.0:
             low, high = 1 / self.scale, self.scale
-            factor = low + (high - low) * uniform(b, 1, 3)
+            points = points * (low + (high - low) * uniform(b, 1, 3))
         if self.shift > 0.0:
-            added.append(self.shift * (2 * uniform(b, 1, 3) - 1))
+            points = points + self.shift * (2 * uniform(b, 1, 3) - 1)
         if self.lift > 0.0 and scale == "above_floor":
             up = torch.arange(3, device=points.device).eq(2).to(points.dtype) * self.lift
-            added.append(up * (2 * uniform(b, 1, 1) - 1))
-
-        def moves(points: Tensor) -> Tensor:
-            if angle is not None:
-                points = rotate_z(points, angle)
-            if factor is not None:
-                points = points * factor
-            for way in added:
-                points = points + way
-            return points
-
-        return moves
-
-
-def augmented(
-    augment: Augment,
-    part: Mapping[str, Tensor],
-    step: Mapping[str, Any],
-    name: str,
-    seed: int,
-    rank: int,
-    scale: str,
-) -> dict[str, Tensor]:
-    """A domain's `part` of a batch, with "points", perhaps "again", and labels, augmented.
-
-    A second draw ("again") is turned, scaled, shifted and lifted as the first: both show one object
-    in one place. Cuts, holes and jitter are each one's own. `step`, `name`, `seed`, `rank`: see
-    `generator_of`.
-    """
-    result, device = dict(part), part["points"].device
-    chance = generator_of(step, name, seed, rank, device)
-    result["points"], moves = augment(part["points"], chance, scale)
-    if "again" in part:
-        chance = generator_of(step, f"{name} again", seed, rank, device)
-        result["again"], _ = augment(part["again"], chance, scale, moves)
-    return result
+            points = points + up * (2 * uniform(b, 1, 1) - 1)
+        if self.jitter_sigma > 0.0:
+            noise = torch.randn(points.shape, generator=generator, device=points.device)
+            noise = (self.jitter_sigma * noise).clamp(-self.jitter_clip, self.jitter_clip)
+            points = points + noise.to(points.dtype)
+        return points
 
 
 def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, " b"]) -> Float[Tensor, "b n 3"]:

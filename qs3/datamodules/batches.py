@@ -103,17 +103,11 @@ class Batches:
     def _batches(self, name: str, part: Clouds | Labelled) -> Iterator[dict[str, Tensor]]:
         clouds = part if isinstance(part, Clouds) else part.clouds
         index = self._order(name, part)
-        uses: dict[str, tuple[str, ...]] = {"points": (name,)}
-        if isinstance(part, Labelled) and part.again:
-            uses["again"] = (name, "again")
-        drawn = {}
-        for key, use in uses.items():
-            one = None
-            if self.shuffle:
-                one = clouds.draw(len(clouds), self._generator("sample", *use, self.epoch))
-            drawn[key] = [None] * len(self) if one is None else one[index].split(self.sizes)
-        for i, rows in enumerate(index.split(self.sizes)):
-            batch = {key: clouds.take(rows, starts[i]) for key, starts in drawn.items()}
+        starts = None
+        if self.shuffle:
+            starts = clouds.draw(len(clouds), self._generator("sample", name, self.epoch))
+        for rows in index.split(self.sizes):
+            batch = {"points": clouds.take(rows, None if starts is None else starts[rows])}
             if isinstance(part, Labelled):
                 batch[part.owner] = part.labels[rows]
             yield batch

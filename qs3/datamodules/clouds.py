@@ -128,14 +128,12 @@ class Labelled:
         owner: their key in a batch: "y_source", "y_pseudo", "y_target_train"; "labels" for a
             module of somebody else.
         balanced: whether all classes are drawn equally often.
-        again: whether a batch has a second draw of each cloud, under the key "again".
     """
 
     clouds: Clouds
     labels: Tensor
     owner: str = "labels"
     balanced: bool = False
-    again: bool = False
 
     def __len__(self) -> int:
         return len(self.clouds)

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from lightning.pytorch import LightningDataModule
 
-from qs3.datamodules.augment import Augment, augmented
-from qs3.datamodules.batches import Batches
+from qs3.datamodules.augment import Augment
+from qs3.datamodules.batches import Batches, generator_of
 from qs3.datamodules.clouds import Clouds, Labelled, labels_of, load_clouds
 from qs3.datamodules.splits import RULES, first_of_class
 from qs3.datasets.domain import Domain, compose_domain
@@ -153,8 +153,9 @@ class DomainData(LightningDataModule):
         result = {key: value for key, value in batch.items() if key not in ("index", "epoch")}
         if self.augment is None or self.trainer is None or not self.trainer.training:
             return result
-        rank = self.trainer.global_rank
-        return augmented(self.augment, result, batch, "augment", self.seed, rank, self.scale)
+        points, rank = batch["points"], self.trainer.global_rank
+        chance = generator_of(batch, "augment", self.seed, rank, points.device)
+        return {**result, "points": self.augment(points, chance, self.scale)}
 
     def _setup_training(self, dataset: PointSet) -> None:
         if len(dataset.indices("train")) == 0:

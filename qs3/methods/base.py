@@ -37,7 +37,6 @@ class Method(nn.Module):
     Attributes:
         labels: whose labels it trains on: "source", or "target_train" (the upper bound only).
         uses_target: whether its batches hold unlabelled target clouds.
-        again: whether they hold a second draw of each source cloud, under the key "again".
         smoothing: of class labels (`class_loss`); the trainer sets it to `protocol.smoothing`.
         metres: whether clouds keep their size (`data.scale`); the trainer says so. A loss with
             lengths in it divides by each cloud's size then.
@@ -45,7 +44,6 @@ class Method(nn.Module):
 
     labels: ClassVar[str] = "source"
     uses_target: ClassVar[bool] = False
-    again: ClassVar[bool] = False
     smoothing: float = 0.0
     metres: bool = False
 

@@ -96,7 +96,6 @@ def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
         seed=run.seed,
         owner=method.labels,
         uses_target=method.uses_target,
-        again=method.again,
     )
     data.prepare_data()
     source, target = run.source.open(verify=False), run.target.open(verify=False)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from qs3.datamodules.augment import REGION_SHARE, Augment, augmented, crop, drop_regions
+from qs3.datamodules.augment import REGION_SHARE, Augment, crop, drop_regions
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -13,7 +13,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def test_jitter_is_clipped():
     points = torch.zeros(2, 1000, 3)
-    noise = Augment(rotate_z=False, jitter_sigma=0.01, jitter_clip=0.02)(points, generator())[0]
+    noise = Augment(rotate_z=False, jitter_sigma=0.01, jitter_clip=0.02)(points, generator())
     assert noise.abs().max() == pytest.approx(0.02)
     assert float(noise.std()) == pytest.approx(0.0095, rel=0.05)
 
@@ -21,7 +21,7 @@ def test_jitter_is_clipped():
 def test_scale_and_shift_are_of_each_cloud_and_axis():
     points = torch.ones(4, 6, 3)
     augment = Augment(rotate_z=False, scale=1.5, shift=0.2, jitter_sigma=0.0)
-    moved, _ = augment(points, generator())
+    moved = augment(points, generator())
     assert (moved.std(dim=1) < 1e-6).all()
     assert len(moved[:, 0].flatten().unique()) == 12
     assert moved.min() > 1 / 1.5 - 0.2
@@ -90,7 +90,7 @@ def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
 def test_a_lift_moves_each_cloud_up_or_down_as_a_whole():
     points = torch.rand(4000, 5, 3, generator=generator())
     augment = Augment(rotate_z=False, jitter_sigma=0.0, lift=0.2)
-    moved = augment(points, generator(), "above_floor")[0] - points
+    moved = augment(points, generator(), "above_floor") - points
     assert torch.equal(moved[..., :2], torch.zeros(4000, 5, 2))
     by = moved[..., 2]
     assert torch.allclose(by, by[:, :1].expand(-1, 5), atol=1e-6)
@@ -98,8 +98,8 @@ def test_a_lift_moves_each_cloud_up_or_down_as_a_whole():
     assert by.max() <= 0.2 + 1e-6
     assert float(by[:, 0].mean()) == pytest.approx(0, abs=0.006)
     assert float(by[:, 0].std()) == pytest.approx(0.2 / 3**0.5, rel=0.03)
-    assert torch.equal(augment(points, generator(), "metres")[0], points)
-    assert torch.equal(augment(points, generator(), "unit_ball")[0], points)
+    assert torch.equal(augment(points, generator(), "metres"), points)
+    assert torch.equal(augment(points, generator(), "unit_ball"), points)
 
 
 def test_a_cut_cloud_fills_the_unit_ball_again_unless_it_has_a_size():
@@ -110,20 +110,6 @@ def test_a_cut_cloud_fills_the_unit_ball_again_unless_it_has_a_size():
     metres = crop(points, 0.3, generator(), "metres")
     assert (metres.norm(dim=2).amax(1) < 0.95).all()
     augment = Augment(crop=0.3, rotate_z=False, jitter_sigma=0.0)
-    assert torch.equal(augment(points, generator(), scale="metres")[0], metres)
+    assert torch.equal(augment(points, generator(), scale="metres"), metres)
     one = torch.ones(2, 5, 3)  # all points at one place: nothing to divide by
     assert torch.equal(crop(one, 0.3, generator(), "unit_ball"), torch.zeros(2, 5, 3))
-
-
-def test_a_second_draw_is_moved_as_the_first_and_cut_on_its_own():
-    points = torch.rand(6, 80, 3, generator=generator()) - 0.5
-    part = {"points": points, "again": points, "y_source": torch.arange(6)}
-    step = ({"epoch": 0, "index": 0}, "source", 0, 0, "metres")
-    moved = augmented(Augment(jitter_sigma=0.0, scale=1.5, shift=0.1), part, *step)
-    assert torch.equal(moved["points"], moved["again"])
-    assert not torch.equal(moved["points"], points)
-    assert moved["y_source"] is part["y_source"]
-    jittered = augmented(Augment(jitter_sigma=0.01), part, *step)
-    assert 0 < (jittered["points"] - jittered["again"]).abs().max() <= 0.1
-    cut = augmented(Augment(crop=0.3, rotate_z=False, jitter_sigma=0.0), part, *step)
-    assert not torch.equal(cut["points"], cut["again"])

@@ -160,24 +160,3 @@ def test_on_a_way_every_cloud_comes_before_any_comes_again(n, size):
     way = seen(batches(n, size, piece=Piece(0, 0, -(-passes * n // size))))
     for i in range(passes):
         assert sorted(way[i * n : (i + 1) * n]) == list(range(n))
-
-
-def test_a_second_draw_is_another_sample_of_the_same_cloud():
-    rng = np.random.default_rng(0)
-    stored = rng.normal(size=(30, 8, 3)).astype(np.float32)
-    order = np.tile(np.arange(8).reshape(4, 2), (30, 1, 1))
-    clouds = Clouds.of(stored, order)
-    drawn = Labelled(clouds, torch.arange(30), "y", again=True)
-    plain = Labelled(clouds, torch.arange(30), "y")
-    same = 0
-    for one, two in zip(
-        *(Batches({"a": part}, 5, seed=0, epoch=1) for part in (drawn, plain)), strict=True
-    ):
-        assert set(two["a"]) == {"points", "y"}
-        assert torch.equal(one["a"]["points"], two["a"]["points"])  # the first draw is as ever
-        for y, points, again in zip(*(one["a"][k] for k in ("y", "points", "again")), strict=True):
-            samples = clouds.at(np.array([int(y)]))
-            samples = [samples.take(torch.tensor([0]), torch.tensor([s]))[0] for s in range(4)]
-            assert any(torch.equal(again, some) for some in samples)
-            same += torch.equal(points, again)
-    assert 1 <= same <= 16  # of 30, a quarter by chance

@@ -19,7 +19,6 @@ from qs3.methods.mlsp import Mlsp
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
-from qs3.methods.twin import Twin
 from qs3.selftraining.pcfea import Pcfea
 from qs3.selftraining.student_selection import Student
 
@@ -65,7 +64,6 @@ CASES = {
     "cpcm": Case(Cpcm, 3),
     "mlsp": Case(lambda: Mlsp(min_points=2), 2),
     "sd": Case(Sd, 2),
-    "twin": Case(Twin, 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),
     "student": Case(Student, 1, source=False, pseudo="hard"),
@@ -92,8 +90,6 @@ def batch_of(
         batch["source"] = {"points": points[0], f"y_{method.labels}": labels}
     if method.uses_target or case.pseudo:
         batch["target"] = {"points": points[1]}
-    if method.again:
-        batch["source"]["again"] = clouds(1)[0]
     if case.pseudo:
         soft = nn.functional.one_hot(labels, classes).float() * 0.7 + 0.3 / classes
         batch["target"]["y_pseudo"] = soft if case.pseudo == "soft" else labels

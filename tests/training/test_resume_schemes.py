@@ -47,7 +47,6 @@ METHODS = {
     "pointdan": ("method=pointdan", NODES),
     "sd": ("method=sd", FEATURED),
     "cpcm": ("method=cpcm",),
-    "twin": ("method=twin",),
     "mlsp": ("method=mlsp", FEATURED),
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
     "pcfea_qbst": ("method=pcfea_qbst", FEATURED),

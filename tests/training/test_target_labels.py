@@ -112,9 +112,8 @@ CASES = [
     (("method=source_only", "selftraining=none"), False),
     (("selftraining.use_source=true",), True),
     *(((f"selection.student={rule}",), False) for rule in STUDENT_RULES),
-    (("method=twin", "selftraining=none"), False),
 ]
-SLOW = ("twin", "last", "entropy", "infomax")  # rules; like the others
+SLOW = ("last", "entropy", "infomax")  # rules; like the others
 
 
 @pytest.mark.parametrize(
@@ -138,7 +137,6 @@ def test_no_target_label_within_reach(toy, tmp_path, watch, settings, class_in_i
     assert watch.found == names
     assert bool(names) == class_in_id
     more = {"y_pseudo"} if rounds else set()
-    more |= {"again"} if "method=twin" in settings else set()
     assert watch.keys == {"points", "y_source"} | more
 
 
