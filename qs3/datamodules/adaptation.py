@@ -35,7 +35,7 @@ class AdaptationData(LightningDataModule):
             (`method=supervised`), which alone asks for them.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
         make_source: a generated source that is not there is made first.
-        val, sampler, clouds_a_class: of the labelled domain, see `DomainData`. "balanced" is for
+        sampler, clouds_a_class: of the labelled domain, see `DomainData`. "balanced" is for
             the source alone: to balance the target's classes takes its true labels.
         shared: points, scale, fps_starts, eval_batch_size, cache_dir and clouds_a_split of both.
 
@@ -58,7 +58,6 @@ class AdaptationData(LightningDataModule):
         owner: str = "source",
         uses_target: bool = False,
         make_source: bool = False,
-        val: str = "lineage",
         sampler: str = "shuffled",
         clouds_a_class: int | None = None,
         **shared: Any,
@@ -68,7 +67,7 @@ class AdaptationData(LightningDataModule):
         self.source, self.make_source = source, make_source
         labelled = source if owner == "source" else target
         shown: dict[str, Any] = {"sampler": sampler, "clouds_a_class": clouds_a_class}
-        self.labelled_domain = DomainData(labelled, val=val, **shown, **shared)
+        self.labelled_domain = DomainData(labelled, **shown, **shared)
         self.target_domain = DomainData(target, labels=False, **shared)
         self.owner, self.uses_target = owner, uses_target
         self.phases, self.scheme, self.augment = phases, scheme, augment

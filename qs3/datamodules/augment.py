@@ -12,19 +12,14 @@ from torch import Tensor
 
 from qs3.utils.settings import settings
 
-REGION_SHARE = (0.1, 0.25)
-"""The smallest and largest share of a cloud's points that a dropped region takes."""
-
 
 @settings
 class Augment:
-    """Cut, holes, turn about z, anisotropic scale, shift, lift and jitter, in this order.
+    """Cut, turn about z, anisotropic scale, shift, lift and jitter, in this order.
 
     Attributes:
         crop: the smallest share of a cloud that stays when a plane cuts it (see `crop`), as the
             picture's border and nearer things cut real objects; 1 leaves it whole.
-        drop_regions: empty one to so many regions of each cloud, at most 3 (see `drop_regions`);
-            0 drops nothing.
         rotate_z: turn each cloud about z by U(0, 2π).
         scale: factor of each axis, U(1 / scale, scale); 1 leaves the size alone.
         shift: added to each axis, U(-shift, shift).
@@ -36,7 +31,6 @@ class Augment:
     """
 
     crop: Annotated[float, Interval(gt=0, le=1)] = 1.0
-    drop_regions: Annotated[int, Interval(ge=0, le=3)] = 0
     rotate_z: bool = True
     scale: Annotated[float, Ge(1)] = 1.0
     shift: Annotated[float, Ge(0)] = 0.0
@@ -64,8 +58,6 @@ class Augment:
 
         if self.crop < 1.0:
             points = crop(points, self.crop, generator, scale)
-        if self.drop_regions:
-            points = drop_regions(points, self.drop_regions, generator)
         if self.rotate_z:
             points = rotate_z(points, 2 * math.pi * uniform(b))
         if self.scale > 1.0:
@@ -116,34 +108,3 @@ def crop(
         radius = moved.norm(dim=2).amax(dim=1)[:, None, None]
         moved = moved / torch.where(radius > 0, radius, 1)
     return moved
-
-
-def drop_regions(
-    points: Float[Tensor, "b n 3"], most: int, generator: torch.Generator
-) -> Float[Tensor, "b n 3"]:
-    """Empty one to `most` regions of each cloud, and repeat points at random in their places.
-
-    A region is the ball around a point that is left, with a tenth to a quarter of the cloud's n
-    points. The paper's M_d (section 4.3) has such holes and gives no parameters: these are those
-    of ours on disk (`qs3.generation.recipes.RegionDropout`), which has new points where this one
-    repeats some, and the same holes in every epoch.
-    """
-    b, n = points.shape[:2]
-    low, high = REGION_SHARE
-
-    def uniform() -> Tensor:
-        return torch.rand(b, generator=generator, device=points.device)
-
-    left = torch.ones(b, n, dtype=torch.bool, device=points.device)
-    regions = 1 + (most * uniform()).long().clamp(max=most - 1)  # [B]
-    for region in range(most):
-        # as `torch.multinomial` draws one, which asks the device whether it can
-        rate = torch.empty_like(points[..., 0]).exponential_(generator=generator)
-        centre = (left / rate).argmax(dim=1, keepdim=True)  # [B, 1]
-        size = (n * (low + (high - low) * uniform())).long() * (region < regions)  # [B]
-        distance = (points - points.take_along_dim(centre[..., None], dim=1)).square().sum(dim=2)
-        order = distance.masked_fill(~left, torch.inf).argsort(dim=1, stable=True)
-        nearest = torch.arange(n, device=points.device) < size[:, None]  # [B, N], in that order
-        left &= ~torch.zeros_like(left).scatter(1, order, nearest)
-    other = torch.multinomial(left.float(), n, replacement=True, generator=generator)  # [B, N]
-    return torch.where(left[..., None], points, points.take_along_dim(other[..., None], dim=1))

@@ -23,7 +23,7 @@ from lightning.pytorch import LightningDataModule
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, generator_of
 from qs3.datamodules.clouds import Clouds, Labelled, labels_of, load_clouds
-from qs3.datamodules.splits import RULES, first_of_class
+from qs3.datamodules.splits import first_of_class, lineage
 from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError, DataError
 from qs3.store.store import PointSet
@@ -42,7 +42,6 @@ class DomainData(LightningDataModule):
         batch_size: of training batches, at least 2 (batch norm).
         eval_batch_size: of all others.
         augment: applied to training batches on their device; None leaves them as they are.
-        val: rule that takes validation clouds from the training split (`splits.RULES`).
         sampler: "shuffled" trains on each cloud once an epoch, "balanced", which takes labels, on
             as many of each class.
         seed: of order, samples and augmentation, each a function of (seed, epoch).
@@ -76,7 +75,6 @@ class DomainData(LightningDataModule):
         batch_size: int = 16,
         eval_batch_size: int = 64,
         augment: Augment | None = None,
-        val: str = "lineage",
         sampler: str = "shuffled",
         seed: int = 0,
         labels: bool = True,
@@ -89,13 +87,12 @@ class DomainData(LightningDataModule):
         if isinstance(domain, str):
             domain = compose_domain(domain, {"paths.data_dir": str(data_dir)})
         domain.check_scale(scale)
-        assert val in RULES
         assert sampler in ("shuffled", "balanced")
         assert labels or (sampler == "shuffled" and clouds_a_class is None)
         self.domain, self.scale, self.points = domain, scale, points
         self.fps_starts = fps_starts
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size
-        self.augment, self.seed, self.val, self.sampler = augment, seed, val, sampler
+        self.augment, self.seed, self.sampler = augment, seed, sampler
         self.has_labels = labels
         self.clouds_a_split, self.clouds_a_class = clouds_a_split, clouds_a_class
         # Indices that are cached are those of whole splits.
@@ -165,7 +162,7 @@ class DomainData(LightningDataModule):
             self.whole = self.train = train
             return
         labels, left = train.labels.numpy(), train
-        chosen, held_out = RULES[self.val](train.ids, labels)
+        chosen, held_out = lineage(train.ids)
         if (few := self.clouds_a_class) is not None:
             chosen, held_out = (first_of_class(part, labels, few) for part in (chosen, held_out))
             left = train.at(np.sort(np.concatenate([chosen, held_out])))

@@ -219,7 +219,7 @@ def _selection(
     return Selection(
         teacher=teacher,
         student=student if run.scheme.rounds else teacher,
-        validation=run.cfg.data.val,
+        validation="lineage",
     )
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from qs3.datamodules.augment import REGION_SHARE, Augment, crop, drop_regions
+from qs3.datamodules.augment import Augment, crop
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -28,37 +28,10 @@ def test_scale_and_shift_are_of_each_cloud_and_axis():
     assert moved.max() < 1.5 + 0.2
 
 
-@pytest.mark.parametrize("wrong", [{"scale": 0.5}, {"crop": 0.0}, {"drop_regions": 4}])
+@pytest.mark.parametrize("wrong", [{"scale": 0.5}, {"crop": 0.0}])
 def test_wrong_settings(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Augment(**wrong)
-
-
-def line(clouds: int, n: int) -> torch.Tensor:
-    """Points 0, 1, ..., n - 1 on the x axis: a region is an interval, and a point its own name."""
-    x = torch.arange(n, dtype=torch.float32)
-    return torch.stack([x, 0 * x, 0 * x], dim=1).expand(clouds, n, 3)
-
-
-def gaps(cloud: torch.Tensor, n: int) -> list[int]:
-    """Lengths of the runs of missing numbers on the `line`."""
-    missing = [i not in set(cloud[:, 0].int().tolist()) for i in range(n)]
-    runs = "".join(" x"[m] for m in missing).split()
-    return [len(run) for run in runs]
-
-
-def test_one_region_is_one_hole_of_a_tenth_to_a_quarter():
-    n = 200
-    points = line(64, n)
-    holed = drop_regions(points, 1, generator())
-    sizes = [gaps(cloud, n) for cloud in holed]
-    assert all(len(found) == 1 for found in sizes)
-    low, high = (share * n for share in REGION_SHARE)
-    assert all(low <= size <= high for (size,) in sizes)
-    assert len({size for (size,) in sizes}) > 10
-    assert torch.equal(points, line(64, n))
-    assert torch.equal(holed, drop_regions(points, 1, generator()))
-    assert not torch.equal(holed, drop_regions(points, 1, generator(1)))
 
 
 def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
