@@ -10,7 +10,7 @@ from qs3.errors import ConfigError
 
 
 def predict(
-    input: Annotated[Path | None, "clouds: a file, a folder, or an archive of objects"] = None,
+    input: Annotated[Path | None, "clouds: a file or a folder"] = None,
     *,
     ckpt: Annotated[str, "a run's or exported folder, result.pt, or a name (default: below)"] = "",
     second: Annotated[str, "another one, for column second, or none (default: below)"] = "",
@@ -30,7 +30,6 @@ def predict(
     ] = None,
     prior: Annotated[str, "how common classes are: rooms, or CLASS:N,CLASS:N"] = "",
     prior_power: Annotated[float, Ge(0), "how much of that is believed: 0 nothing, 1 all"] = 0.5,
-    part: Annotated[str, "of an archive (default: adapt, or all but judge), or all"] = "",
     out: Annotated[Path, "table, .csv"] = Path("predictions.csv"),
     page: Annotated[bool, "also a page with pictures, .html"] = True,
     batch_size: Annotated[int, Ge(1), "clouds that the net sees at a time"] = 16,
@@ -85,7 +84,7 @@ def predict(
     opinion = None if other == "none" else steps.second_opinion(other, first, floor, **how)
     if depth is None:
         assert input is not None
-        found = inputs.clouds(input, up or "z", part, first.classes)
+        found = inputs.clouds(input, up or "z", first.classes)
     else:
         gravity = first.result.gravity
         found = inputs.depth_images(depth, mask, box, intrinsics, depth_scale, up, gravity)

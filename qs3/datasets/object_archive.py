@@ -9,9 +9,6 @@
     inlier         [P] bool       optional: false for stray points
     sub            [N] text       optional: finer name
     dev            [N] text       optional: which part of a development split it is of
-    pixels         [N] int        optional: pixels with depth that it was cut from
-    rim, occ       [N] float      optional: share of its outline that the picture cuts off, and that
-                                  something nearer covers
 
 Frames in a row show one room: objects of one block of frames are not independent, and a part of the
 archive that judges is blocks away from one that is trained on.
@@ -45,7 +42,7 @@ ADAPT, JUDGE = "adapt", "judge"
 """Parts of an archive's `dev`: what one trains and chooses on, and what is looked at once."""
 
 _METRES = 1e-4
-_OPTIONAL = ("inlier", "sub", "dev", "pixels", "rim", "occ")
+_OPTIONAL = ("inlier", "sub", "dev")
 _REQUIRED = ("xyz_tenth_mm", "centre_m", "start", "cls", "tier", "img")
 
 
@@ -73,20 +70,15 @@ class Archive:
         return len(self.cls)
 
     @property
-    def parts(self) -> dict[str, int]:
-        """Objects of each part of `dev`, by name."""
-        return dict(sorted(Counter(self.dev[self.dev != ""].tolist()).items()))
+    def parts(self) -> list[str]:
+        """Names of the parts of `dev`."""
+        return sorted({*self.dev.tolist()} - {""})
 
     def of_part(self, part: str) -> list[int]:
         """Positions of the objects of a part; ConfigError if there are none."""
         if part not in self.parts:
             raise ConfigError(f"part={part}: {self.path} has the parts {', '.join(self.parts)}")
         return np.flatnonzero(self.dev == part).tolist()
-
-    def size(self, index: int) -> int:
-        """Points of an object, stray ones too."""
-        start = self.arrays["start"]
-        return int(start[index + 1] - start[index])
 
     def cloud(self, index: int) -> Float[np.ndarray, "n 3"]:
         """[n, 3] float32 metres, z up, the camera at the origin, without stray points."""

@@ -1,4 +1,4 @@
-"""What `qs3 predict` reads: files of clouds, an archive of cut objects, or depth images.
+"""What `qs3 predict` reads: files of clouds, or depth images.
 
 All of them become `Sample`s, one after the other; what cannot be read is a sample that failed, and
 the others go on.
@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
 from qs3.datasets.clouds import SUFFIXES, CloudFile, parse_clouds, with_depth
-from qs3.datasets.cutting import Fault, Piece, faults
+from qs3.datasets.cutting import Fault
 from qs3.datasets.depth_images import (
     Intrinsics,
     check_intrinsics,
@@ -28,15 +28,11 @@ from qs3.datasets.depth_images import (
     read_mask,
 )
 from qs3.datasets.importing import UP_AXES, turned
-from qs3.datasets.object_archive import ADAPT, JUDGE, Archive, is_archive, read_archive
-from qs3.datasets.pointed import RULES, point_out
+from qs3.datasets.pointed import point_out
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from qs3.utils.text_table import printable
-
-ALL = "all"
-"""For `part=`: every object of an archive."""
 
 _IMAGES = (".png", ".npy")
 _ON_MESH = 8192  # points; nets take some of them, as far apart as can be
@@ -51,7 +47,7 @@ class Sample:
         name: relative to the input; name[3] is cloud 3 of a file that holds several, or object 3 of
             a depth image's mask.
         cloud: [n, 3], `axis` up; None if it failed, or when it is not needed any more.
-        dropped: points left out: without depth or marked as stray; of a depth image the object's
+        dropped: points left out, without depth; of a depth image the object's
             pixels without depth. None if it could not be read.
         axis: the axis of `cloud` that points up.
         label: what it is, if that is known: a class of the net's, or another word; "" if not.
@@ -139,16 +135,14 @@ def find_files(
     return found, place, Counter(path.suffix for path in {*there} - {*found})
 
 
-def clouds(place: Path, up: str, part: str, classes: Sequence[str]) -> Inputs:
-    """The clouds of files, or the objects of an archive.
+def clouds(place: Path, up: str, classes: Sequence[str]) -> Inputs:
+    """The clouds of files.
 
     A cloud's label is that of its file, where numbers count the classes from 0, else the nearest
     folder below `place` that is called as a class.
     """
     if up not in UP_AXES:
         raise ConfigError(f"up={up}: give one of {' '.join(UP_AXES)}")
-    if place.is_file() and is_archive(place):
-        return _archive(read_archive(place), part, classes)
     if (place / "manifest.csv").is_file():  # its other arrays are clouds, too
         place = place / "points.npy"
     files, root, others = find_files(place)
@@ -182,46 +176,6 @@ def clouds_of(
             yield Sample(own, cloud, dropped, axis, label, up=axis)
         except DataError as error:
             yield Sample(own, dropped=len(given), label=label, points=0).failed(error, own)
-
-
-def _archive(archive: Archive, part: str, classes: Sequence[str]) -> Inputs:
-    """The objects of a part of an archive, without stray points.
-
-    Without a part: `adapt` where there is one, else all but `judge`, which is looked at once.
-    """
-    chosen = list(range(len(archive)))
-    part = part or (ADAPT if ADAPT in archive.parts else "")
-    if part and part != ALL:
-        chosen, taken = archive.of_part(part), f"part {part}"
-    elif not part and JUDGE in archive.parts:
-        chosen, taken = np.flatnonzero(archive.dev != JUDGE).tolist(), f"all but part {JUDGE}"
-    else:
-        taken = "all objects"
-    units = [partial(_object, archive, i, classes) for i in chosen]
-    counts = ", ".join(f"{name} {count}" for name, count in archive.parts.items())
-    return Inputs(units, "object", [f"{taken} of {counts} (part=)"] if counts else [])
-
-
-def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sample]:
-    cloud = archive.cloud(index)
-    tier, cautions = str(archive.tier[index]), []
-    if tier == "hard":
-        known = (archive.arrays.get(key) for key in ("pixels", "rim", "occ"))
-        pixels, rim, occ = (0.0 if one is None else float(one[index]) for one in known)
-        extent: Any = tuple(np.ptp(cloud, axis=0).tolist())
-        inlier, seen = np.ones(len(cloud), dtype=bool), int(pixels) or len(cloud)
-        piece = Piece(cloud, inlier, seen, holes=0.0, rim=rim, occ=occ, extent_m=extent)
-        cautions = faults(piece, "", RULES)
-        cautions = cautions or [Fault("otherwise hard", "the archive calls it hard")]
-    yield Sample(
-        f"{archive.path.name}[{index}]",
-        cloud,
-        archive.size(index) - len(cloud),
-        label=_label(str(archive.cls[index]), classes),
-        tier=tier,
-        cautions=tuple(cautions),
-        up="z",
-    )
 
 
 def depth_images(

@@ -168,7 +168,6 @@ class Scores:
     balanced: float  # mean over the classes that are there of the share that is right
     majority: tuple[str, int]  # the commonest label, and how many have it
     confidence: float  # mean over all of them
-    tiers: dict[str, Count]
     kinds: dict[str, tuple[Count, Count]]  # by what was wrong with a cloud: with it, without it
     confusion: Int[np.ndarray, "c c"]  # how often each label (row) was called each class
     unknown: dict[str, int]  # labels that are not among the net's classes, and how often
@@ -196,10 +195,6 @@ def scores(samples: Sequence[Sample], classes: Sequence[str]) -> Scores | None:
         float((confusion.diagonal()[totals > 0] / totals[totals > 0]).mean()),
         Counter(one.label for one in judged).most_common(1)[0],
         float(np.mean([one.confidence for one in judged])),
-        {
-            tier: count(one for one in judged if one.tier == tier)
-            for tier in sorted({one.tier for one in judged} - {""})
-        },
         {
             kind: (
                 count(one for one in judged if kind in kinds(one)),
@@ -232,7 +227,7 @@ def summary(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
             f"camera for {ups[LEVEL]} (up=)"
         )
     if dropped := sum(one.dropped or 0 for one in good):
-        lines.append(f"{dropped} points left out, without depth or stray (column dropped)")
+        lines.append(f"{dropped} points left out, without depth (column dropped)")
     if failed:
         lines.append(f"{len(failed)} failed:")
         lines += [f"  {one.name}: {one.reason}" for one in failed[:_SHOWN]]
@@ -246,15 +241,11 @@ def _scored(samples: Sequence[Sample], classes: Sequence[str]) -> list[str]:
     if found is None:
         return []
 
-    def of(count: Count) -> str:
-        return f"{count.right} of {count.of} ({count.share:.1%})"
-
-    tiers = "".join(f"; {tier} {of(count)}" for tier, count in found.tiers.items())
     label, times = found.majority
-    line = f"right {of(found.all)}, balanced {found.balanced:.1%}{tiers}"
+    line = f"right {found.all.right} of {found.all.of} ({found.all.share:.1%})"
     others = ", ".join(f"{name} {n}" for name, n in found.unknown.items())
     return [
-        f"{line}; always {label}: {times / found.all.of:.1%}",
+        f"{line}, balanced {found.balanced:.1%}; always {label}: {times / found.all.of:.1%}",
         *([f"labels that are not classes, left out: {others}"] if others else []),
     ]
 

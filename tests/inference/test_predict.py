@@ -15,15 +15,13 @@ import trimesh
 import qs3
 from qs3.evaluation.unlabelled import read_prior
 from qs3.geometry.sampling import surface_sample
-from qs3.inference import inputs, model_file
+from qs3.inference import model_file
 from qs3.inference.export import export_folder
 from qs3.inference.model_file import read_result, write_result
 from qs3.inference.predict import DISPUTED
 from qs3.runs.metrics import read_metrics
 from qs3.runs.predictions import read_predictions
 from qs3.store.store import open_pointset
-from tests.fixtures.frame_files import write_archive
-from tests.fixtures.published import CLASSES
 from tests.inference.conftest import predict, probabilities, table
 from tests.running import main
 
@@ -294,51 +292,21 @@ def test_without_a_name_the_floor_decides(run, high_net, tmp_path, monkeypatch, 
     assert "second classifier" not in capsys.readouterr().out
 
 
-def test_an_archive_with_labels_shows_right_and_wrong(run, tmp_path, capsys):
-    """Its classes are ten; of three of them the net's names are put in."""
-    arrays = write_archive(tmp_path / "objects.npz", {"train": 3, "test": 1}, points=90)
-    ours = dict(zip(CLASSES, ["ball", "rod", "slab", "ball"], strict=False))
-    arrays["cls"] = np.array([ours.get(cls, cls) for cls in arrays["cls"].tolist()])
-    arrays["occ"][arrays["tier"] == "hard"] = 0.3
-    np.savez(tmp_path / "objects.npz", **arrays)
+def test_labels_show_right_and_wrong(run, clouds, tmp_path, capsys):
+    labels = np.array(["ball", "rod", "slab", "cup"] * 6)
+    np.savez(tmp_path / "labelled.npz", points=clouds, label=labels)
     out = tmp_path / "said.csv"
-    assert predict(run, out, f"{tmp_path}/objects.npz", "part=adapt") == 0
+    assert predict(run, out, f"{tmp_path}/labelled.npz") == 0
     rows = table(out)
-    of_part = np.flatnonzero(arrays["dev"] == "adapt")
-    assert [row["file"] for row in rows] == [f"objects.npz[{i}]" for i in of_part]
-    assert [row["tier"] for row in rows] == arrays["tier"][of_part].tolist()
-    assert [row["label"] for row in rows] == arrays["cls"][of_part].tolist()
-    for row in rows:
-        assert ("30% of its outline covered" in row["caution"]) == (row["tier"] == "hard")
-    judged = [row for row in rows if row["label"] in ("ball", "rod", "slab")]
+    assert [row["label"] for row in rows] == labels.tolist()
+    judged = [row for row in rows if row["label"] != "cup"]
     right = [row for row in judged if row["label"] == row["class"]]
-    clean = [row for row in judged if row["tier"] == "clean"]
     printed = capsys.readouterr().out
     assert f"right {len(right)} of {len(judged)} (" in printed
-    assert f"clean {sum(row in right for row in clean)} of {len(clean)} (" in printed
+    assert "labels that are not classes, left out: cup 6" in printed
     page = out.with_suffix(".html").read_text()
     assert f"{len(right)} of {len(judged)} right" in page
     cards = re.findall(r'"card wrong">.*?class="said">(\w+) (\d+)%', page, flags=re.DOTALL)
     assert len(cards) == len(judged) - len(right) > 1
     sure = [int(percent) for _, percent in cards]
     assert sure == sorted(sure, reverse=True)
-
-
-@pytest.mark.parametrize(
-    ("parts", "given", "taken"),
-    [
-        (("adapt", "judge"), "", {"adapt"}),
-        (("adapt", "judge"), "judge", {"judge"}),
-        (("adapt", "judge"), "all", {"adapt", "judge", "gap"}),
-        (("mine", "judge"), "", {"mine", "gap"}),
-        (("mine", "yours"), "", {"mine", "yours", "gap"}),
-    ],
-)
-def test_of_an_archive_goes_what_one_chooses_on(tmp_path, parts, given, taken):
-    arrays = write_archive(tmp_path / "objects.npz", {"train": 1, "test": 1}, points=64)
-    names = dict(zip(("adapt", "judge", "gap"), (*parts, "gap"), strict=True))
-    arrays["dev"] = np.array([names[part] for part in arrays["dev"].tolist()])
-    np.savez(tmp_path / "objects.npz", **arrays)
-    units = inputs.clouds(tmp_path / "objects.npz", "z", given, CLASSES).units
-    which = [int(one.name[12:-1]) for unit in units for one in unit()]
-    assert which == [i for i, part in enumerate(arrays["dev"].tolist()) if part in taken]
