@@ -135,7 +135,6 @@ class DefRec(Method):
         min_points: of a voxel that may be deformed: 40 in the released code, 20 in QS3's; of
             clouds of 1024 points, in proportion of others (see `deform`).
         pcm: mix source clouds: DefRec+PCM.
-        on_source: reconstruct source clouds, too (a switch of the released code).
         dropout: of the reconstruction head, after its first two layers.
     """
 
@@ -148,12 +147,11 @@ class DefRec(Method):
         scale: Weight = 20.0,
         min_points: Annotated[int, Ge(1)] = 40,
         pcm: bool = False,
-        on_source: bool = False,
         dropout: Share = 0.5,
     ) -> None:
         super().__init__()
         self.defrec_weight, self.scale, self.min_points = defrec_weight, scale, min_points
-        self.pcm, self.on_source, self.dropout = pcm, on_source, dropout
+        self.pcm, self.dropout = pcm, dropout
         self.head: ReconstructionHead | None = None
 
     def prepare(self, net: nn.Module) -> None:
@@ -161,14 +159,11 @@ class DefRec(Method):
         self.head = ReconstructionHead(net, self.dropout)
 
     def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:
-        """Terms "ce" or "pcm", and "defrec" (and "defrec_source"), each >= 0."""
-        source = batch["source"]
-        name, supervised = source_loss(net, source, generator, self.smoothing, self.pcm)
+        """Terms "ce" or "pcm", and "defrec", each >= 0."""
+        name, supervised = source_loss(net, batch["source"], generator, self.smoothing, self.pcm)
         terms = {name: (1 - self.defrec_weight) * supervised}
         with use_domain(net, "target"):
             terms["defrec"] = self._reconstruction(net, batch["target"]["points"], generator)
-        if self.on_source:
-            terms["defrec_source"] = self._reconstruction(net, source["points"], generator)
         return terms
 
     def _reconstruction(self, net: Any, points: Tensor, generator: torch.Generator) -> Tensor:

@@ -8,7 +8,7 @@ Valpola, "Mean teachers are better role models", NeurIPS 2017.
 
 import copy
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import torch
 from annotated_types import Gt
@@ -49,8 +49,9 @@ class Sd(Method):
 
     f: the backbone's vector of a cloud [B, D]; g: the same of the teacher in eval mode, which no
     gradient reaches; x: the batch's clouds of both domains; x': as they are spoilt for the student
-    (`spoilt`); H(q, p) = -sum_d q_d log p_d, mean over the clouds; p: progress of the warm-up. The
-    D features serve as logits; T_t < T_s sharpens what the student is to follow.
+    (`spoilt`), of which the source's alone are cut, as in the released code; H(q, p) =
+    -sum_d q_d log p_d, mean over the clouds; p: progress of the warm-up. The D features serve as
+    logits; T_t < T_s sharpens what the student is to follow.
 
     After step t = 0, 1, ... the teacher takes the part max(1 / (t + 1), 1 - m) of the student's
     weights and statistics: a plain mean at first.
@@ -59,8 +60,6 @@ class Sd(Method):
         consistency_weight: w; 1 in the released code's logs, 0 trains on the source alone.
         momentum: m.
         teacher_temperature, student_temperature: T_t, T_s.
-        cut: whose spoilt clouds are cut, too: "source" as in the released code, which does so to
-            those of CAD models, "both" or "none".
 
     Of the released code's spoiling the elastic distortion is left out. Turn and jitter are those of
     `protocol.augment`, before: teacher and student see the same ones.
@@ -76,10 +75,9 @@ class Sd(Method):
         momentum: Share = 0.999,
         teacher_temperature: Annotated[float, Gt(0)] = 0.1,
         student_temperature: Annotated[float, Gt(0)] = 0.5,
-        cut: Literal["source", "both", "none"] = "source",
     ) -> None:
         super().__init__()
-        self.consistency_weight, self.momentum, self.cut = consistency_weight, momentum, cut
+        self.consistency_weight, self.momentum = consistency_weight, momentum
         self.teacher_temperature = teacher_temperature
         self.student_temperature = student_temperature
         self.teacher: Any = None
@@ -109,7 +107,7 @@ class Sd(Method):
         found = {}
         for domain in ("source", "target"):
             points = batch[domain]["points"]
-            kept = KEPT if self.cut in (domain, "both") else 1.0
+            kept = KEPT if domain == "source" else 1.0
             with use_domain(net, domain), use_domain(self.teacher, domain):
                 student = net.features(spoilt(points, kept, generator)).global_  # [B, D]
                 teacher = self.teacher.features(points).global_

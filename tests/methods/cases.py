@@ -57,7 +57,6 @@ CASES = {
     "dann_apart": Case(lambda: Dann(domain_batches="apart"), 2),
     "pointdan": Case(PointDan, 2),
     "defrec": Case(lambda: DefRec(min_points=2), 2),
-    "defrec_on_source": Case(lambda: DefRec(min_points=2, on_source=True), 3),
     "defrec_pcm": Case(lambda: DefRec(min_points=2, pcm=True), 2),
     "gast": Case(lambda: Gast(min_points=2), 5),
     "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),

@@ -28,7 +28,7 @@ from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
 from tests.models.onnx_files import write_encoder
 
 LEARNING = [
-    *("source_only", "pcm", "dann", "defrec_on_source", "defrec_pcm", "gast", "gast_pcm"),
+    *("source_only", "pcm", "dann", "defrec", "defrec_pcm", "gast", "gast_pcm"),
     *("pointdan", "cpcm", "mlsp", "sd", "pcfea_styled", "student_lrent"),
 ]
 WITHOUT_CHANCE = ("source_only", "dann", "pointdan", "pcfea_styled", "student_lrent")
@@ -99,7 +99,7 @@ def test_defaults_are_those_of_the_configs() -> None:
             assert {p.name: p.default for p in taken if p.default is not p.empty} == written
 
 
-NEED_POINTS = {"defrec", "defrec_on_source", "defrec_pcm", "mlsp"}
+NEED_POINTS = {"defrec", "defrec_pcm", "mlsp"}
 TRAIN_FEATURES = {"dann", "dann_apart", "sd", "gast", "gast_pcm"}
 
 
