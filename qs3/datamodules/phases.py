@@ -107,7 +107,6 @@ class SelfTrainingConfig:
         weight_step: by how much the weight of both losses falls each epoch of the rounds, from 1
             (GAST's code: 0.005; both fall alike, so only its relation to the weight decay matters).
         mrkld: weight of CRST's regulariser (see `qs3.selftraining.student_selection`); 0 is none.
-        missing_class: what to do if a class has no pseudo-label: "warn" or "error".
         rehearsal: train on all target samples, whatever the selector keeps (`debug=fast`).
 
     Raises:
@@ -127,7 +126,6 @@ class SelfTrainingConfig:
     pcm: bool = False
     weight_step: Annotated[float, Ge(0)] = 0.0
     mrkld: Annotated[float, Ge(0)] = 0.0
-    missing_class: Literal["warn", "error"] = "warn"
     rehearsal: bool = False
 
     def __post_init__(self) -> None:

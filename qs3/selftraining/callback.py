@@ -153,9 +153,7 @@ class SelfTraining(Callback):
                 selection.selected,
                 self.classes,
             )
-        missing = check_selection(
-            selection, self.classes, round_, self.scheme.missing_class, trainer.world_size
-        )
+        missing = check_selection(selection, self.classes, round_, trainer.world_size)
         labels = torch.from_numpy(teacher.predicted)
         index = torch.from_numpy(selection.selected.nonzero()[0])
         if selection.soft is None:

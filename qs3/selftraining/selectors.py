@@ -268,18 +268,17 @@ def check_selection(
     selection: Selection,
     class_names: Sequence[str],
     round_: int,
-    missing_class: str,
     processes: int = 1,
 ) -> list[str]:
     """Names of the classes without a pseudo-label, after checking that training is possible.
 
     Raises:
         SelectionError: one of the `processes` has fewer than two samples (batch normalisation needs
-            two), or a class is missing and `missing_class` is "error".
+            two).
     """
     missing = [name for name, n in zip(class_names, selection.kept, strict=True) if n == 0]
     total = int(selection.kept.sum())
-    if total <= processes or (missing and missing_class == "error"):
+    if total <= processes:
         raise SelectionError(
             f"round {round_}: {total} pseudo-labels above theta={selection.theta:g}, none for "
             f"{', '.join(missing) or 'none of the classes'}; lower the threshold, or train the "

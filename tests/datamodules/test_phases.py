@@ -123,7 +123,7 @@ def test_what_is_not_set_is_the_paper_s():
     [
         {"theta": -0.1}, {"theta": 1.0}, {"rounds": -1}, {"epochs": 0}, {"batch_size": 1},
         {"steps": 0}, {"share": 0.0}, {"share": 1.0}, {"mrkld": -0.1}, {"weight_step": -0.01},
-        {"init": "warm"}, {"missing_class": "ignore"},
+        {"init": "warm"},
     ],
 )  # fmt: skip
 def test_settings_out_of_their_range_are_refused(wrong):

@@ -216,7 +216,7 @@ def shared_folders(folder: Path) -> list[Path]:
     "selftraining", ["qbst", *(pytest.param(n, marks=pytest.mark.slow) for n in ("spst", "cbst"))]
 )
 def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
-    more = [f"selftraining={selftraining}", "selftraining.missing_class=warn"]
+    more = [f"selftraining={selftraining}"]
     alone = toy(*more, "paths.warmup_dir=null")
     train(alone)
     expected = result_of(run_folder(alone))
