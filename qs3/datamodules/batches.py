@@ -104,8 +104,9 @@ class Batches:
         clouds = part if isinstance(part, Clouds) else part.clouds
         index = self._order(name, part)
         starts = None
-        if self.shuffle:
-            starts = clouds.draw(len(clouds), self._generator("sample", name, self.epoch))
+        if self.shuffle and clouds.starts > 1:
+            chance = self._generator("sample", name, self.epoch)
+            starts = torch.randint(clouds.starts, (len(clouds),), generator=chance)
         for rows in index.split(self.sizes):
             batch = {"points": clouds.take(rows, None if starts is None else starts[rows])}
             if isinstance(part, Labelled):

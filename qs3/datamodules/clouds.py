@@ -78,12 +78,6 @@ class Clouds:
         """Samples to choose from, numbered from 0; number 0 begins at point 0."""
         return 1 if self.order is None else self.order.shape[1]
 
-    def draw(self, n: int, generator: torch.Generator) -> Int[Tensor, " n"] | None:
-        """In which sample each of n clouds is seen; None, with nothing drawn, if there is one."""
-        if self.starts == 1:
-            return None
-        return torch.randint(self.starts, (n,), generator=generator)
-
     def at(self, index: Shaped[np.ndarray, " k"]) -> Clouds:
         """A part of these clouds, by positions or by a mask; nothing is copied."""
         return dataclasses.replace(self, rows=self.rows[index])

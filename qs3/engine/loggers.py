@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import Logger
 
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
@@ -77,13 +76,3 @@ class EpochRows(Callback):
         with reading(self.file):
             rows = csv.DictReader(io.StringIO(self.file.read_text("utf-8")), strict=True)
             return [row for row in rows if int(row["epoch"]) < before]
-
-
-def wandb(**settings: Any) -> Logger:
-    """Lightning's logger for Weights & Biases; see conf/logger/wandb.yaml."""
-    from lightning.pytorch.loggers import WandbLogger
-
-    logger = WandbLogger(**settings)
-    # Lightning always passes it, and wandb 0.31 warns about it.
-    logger._wandb_init.pop("anonymous", None)
-    return logger

@@ -145,8 +145,6 @@ def _make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
     """Lightning's trainer by config group `trainer`; `more`: arguments that follow from the run."""
     settings: Any = OmegaConf.to_container(cfg.trainer, resolve=True)
     given = {key: value for key, value in settings.items() if key not in _OURS}
-    if isinstance(given.get("profiler"), dict):
-        given["profiler"] = build(cfg.trainer.profiler)
     return Trainer(
         **given,
         **more,
