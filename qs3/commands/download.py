@@ -1,13 +1,10 @@
 """`qs3 download` and `qs3 scannet`: published datasets, put where their domain looks for them."""
 
-import os
 import textwrap
 from pathlib import Path
 from typing import Annotated
 
 from annotated_types import Ge
-
-MIRROR = "QS3_DOWNLOAD_MIRROR"
 
 
 def download(
@@ -15,15 +12,12 @@ def download(
     *,
     into: Annotated[Path, "the data folder, paths.data_dir of a run"] = Path("data"),
     accept_terms: Annotated[str, "the agreement that you have made, e.g. scannet"] = "",
-    mirror: Annotated[str, f"address of a copy of the archives; else that of ${MIRROR}"] = "",
     archive: Annotated[Path | None, "unpack this, e.g. what your browser downloaded"] = None,
-    root: Annotated[str, "folder in the archive to take, if it cannot be found out"] = "",
 ) -> int:
     """Published datasets, put where their domain looks for them.
 
-    Archives come to downloads/ in the data folder, what is in them to published/. On a mirror each
-    lies under the name that the list shows. What is in place is left alone. .download.json in the
-    folder notes the SHA-256 of the archive.
+    Archives come to downloads/ in the data folder, what is in them to published/. What is in place
+    is left alone.
 
     Example:
         qs3 download                              what there is
@@ -42,10 +36,9 @@ def download(
         return 1
     if name not in SOURCES:
         raise ConfigError(f"{name!r} cannot be downloaded; {meant(name, [*SOURCES, *BY_HAND])}")
-    source, mirror = SOURCES[name], mirror or os.environ.get(MIRROR, "")
-    terms = {"accept_terms": accept_terms, "mirror": mirror, "root": root}
+    source = SOURCES[name]
     try:
-        places = provide(source, into, archive=archive, **terms)
+        places = provide(source, into, accept_terms=accept_terms, archive=archive)
     except AgreementError as error:
         print(error)
         return 1

@@ -17,11 +17,8 @@ from typing import Any
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
 from qs3.errors import DataError, Qs3Error
-from qs3.utils.files import locked, make_folder, reading, sha256_file, write_json
+from qs3.utils.files import locked, make_folder, reading
 from qs3.utils.settings import settings
-
-MARK = ".download.json"
-"""In a folder that was put in place: where it came from. Importers pass over hidden files."""
 
 _FILE: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("sources.yaml").read_text())
 
@@ -60,8 +57,6 @@ class Source:
     address: str = ""
     drive: str = ""
     agreement: str = ""
-    size: int | None = None
-    sha256: str | None = None
     size_says: str = "not known beforehand"
 
     @property
@@ -71,7 +66,7 @@ class Source:
 
     @property
     def file(self) -> str:
-        """Its name in the folder of downloads and on a mirror."""
+        """Its name in the folder of downloads."""
         return f"{self.name}.zip" if self.drive else self.address.rpartition("/")[2]
 
     @property
@@ -88,9 +83,7 @@ def provide(
     into: Path = Path("data"),
     *,
     accept_terms: str = "",
-    mirror: str = "",
     archive: Path | None = None,
-    root: str = "",
 ) -> list[Path]:
     """Bring the folders of a source to where their importers look; what is there stays.
 
@@ -107,38 +100,31 @@ def provide(
         pairs = zip(source.parts, places, strict=True)
         missing = [(part, at) for part, at in pairs if not at.exists() or not any(at.iterdir())]
         if missing:
-            path = archive or fetch(source, downloads / source.file, mirror)
+            path = archive or fetch(source, downloads / source.file)
             building = published / f".{source.name}.unpacking"
             shutil.rmtree(building, ignore_errors=True)  # what a killed run left
             try:
-                _place(source, missing, path, root, building)
+                _place(missing, path, building)
             finally:
                 shutil.rmtree(building, ignore_errors=True)
     return places
 
 
-def _place(
-    source: Source, missing: list[tuple[Part, Path]], archive: Path, root: str, building: Path
-) -> None:
+def _place(missing: list[tuple[Part, Path]], archive: Path, building: Path) -> None:
     """Unpack into a folder next to the final ones, find the parts, and rename them into place."""
     files = unpack(archive, building)
-    folders = [root.strip("/") or find_folder(archive, files, part) for part, _ in missing]
-    sha256 = sha256_file(archive)
+    folders = [find_folder(archive, files, part) for part, _ in missing]
     for (_, place), found in zip(missing, folders, strict=True):
-        mark = {"source": source.name, "root": found, "sha256": sha256}
-        write_json(building / found / MARK, {**mark, "size": archive.stat().st_size})
         make_folder(place.parent)
         if place.is_dir():
             place.rmdir()  # empty
         os.rename(building / found, place)
 
 
-def fetch(source: Source, path: Path, mirror: str = "") -> Path:
-    """Bring a source's archive to `path`; one that is there already is checked and left alone."""
+def fetch(source: Source, path: Path) -> Path:
+    """Bring a source's archive to `path`; one that is there already is left alone."""
     import pooch
     import requests
-
-    url = f"{mirror.rstrip('/')}/{source.file}" if mirror else source.page
 
     def from_drive(_url: str, output_file: str, _pooch: Any) -> None:
         import gdown
@@ -148,15 +134,14 @@ def fetch(source: Source, path: Path, mirror: str = "") -> Path:
         except gdown.exceptions.DownloadError as error:
             raise ValueError(f"Google Drive does not give it: {error}") from error
 
-    downloader = None if mirror or not source.drive else from_drive
-    advice = f"open {source.page} in a browser and give the file with archive=PATH"
+    downloader = from_drive if source.drive else None
     try:
-        pooch.retrieve(url, source.sha256, path.name, path.parent, downloader=downloader)
-    except (requests.RequestException, ValueError) as error:  # ValueError: another hash
-        raise Qs3Error(f"{url}: {error}. Run the same command again, or {advice}") from error
-    if source.size not in (None, path.stat().st_size):
-        path.unlink()
-        raise Qs3Error(f"{url} does not have {source.size} bytes; {advice}")
+        pooch.retrieve(source.page, None, path.name, path.parent, downloader=downloader)
+    except (requests.RequestException, ValueError) as error:
+        raise Qs3Error(
+            f"{source.page}: {error}. Run the same command again, or open it in a browser and give "
+            "the file with archive=PATH"
+        ) from error
     return path
 
 
@@ -189,6 +174,7 @@ def find_folder(archive: Path, files: Iterable[str], part: Part) -> str:
     if len(large) != 1:
         raise DataError(
             f"{archive}: folders of {part.of_layout('says')}: {', '.join(large) or 'none'}, of "
-            f"{sorted({file.rpartition('/')[0] for file in files})[:12]}; take one by root=FOLDER"
+            f"{sorted({file.rpartition('/')[0] for file in files})[:12]}; unpack "
+            "the wanted one by hand"
         )
     return large[0].rstrip("/")
