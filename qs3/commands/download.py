@@ -26,7 +26,6 @@ def download(
     """
     from qs3.datasets.download import BY_HAND, SOURCES, AgreementError, provide
     from qs3.errors import ConfigError
-    from qs3.utils.commands import meant
 
     if not name:
         print(listing())
@@ -35,7 +34,7 @@ def download(
         print(BY_HAND[name]["how"])
         return 1
     if name not in SOURCES:
-        raise ConfigError(f"{name!r} cannot be downloaded; {meant(name, [*SOURCES, *BY_HAND])}")
+        raise ConfigError(f"{name!r} cannot be downloaded; there are {', '.join(SOURCES)}")
     source = SOURCES[name]
     try:
         places = provide(source, into, accept_terms=accept_terms, archive=archive)

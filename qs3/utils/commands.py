@@ -13,14 +13,13 @@ Parameters before the `*` also take words without "="; `*words` takes any number
 imported only when a command runs or shows its help.
 """
 
-import difflib
 import functools
 import inspect
 import os
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter
 from pathlib import Path
 from pkgutil import resolve_name
@@ -33,7 +32,7 @@ from qs3.utils.version import VERSION
 
 INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
-_HELP = ("-h", "--help", "help")
+_HELP = ("-h", "--help")
 _WIDTH = 100
 _AGAIN = "ended; run the same command again and it continues"
 _WORDS = {int: "N", float: "NUMBER", bool: "true|false", Path: "PATH", str: "TEXT"}
@@ -63,9 +62,7 @@ def run(commands: Commands, argv: Sequence[str], name: str = "qs3", about: str =
 
 def _dispatch(commands: Commands, argv: list[str], name: str, about: str) -> int:
     first, *rest = argv or ["--help"]
-    if first == "help" and rest:
-        first, *rest = *rest, "--help"
-    if first in ("--version", "version"):
+    if first == "--version":
         print(f"qs3 {VERSION}")
         return 0
     if first in _HELP:
@@ -77,11 +74,12 @@ def _dispatch(commands: Commands, argv: list[str], name: str, about: str) -> int
     elif "" in commands and "=" in first:
         found, rest = commands[""], argv
     else:
-        raise ConfigError(f"unknown command {first!r}; {meant(first, filter(None, commands))}")
+        known = ", ".join(filter(None, commands))
+        raise ConfigError(f"unknown command {first!r}; there are {known}")
     if not isinstance(found, str):
         return _dispatch(found, rest, name, "")
     function = resolve_name(found)
-    if {*_HELP[:2]} & {*rest} or rest == ["help"]:
+    if {*_HELP} & {*rest}:
         print(_help(function, name))
         return 0
     words, given = parse(function, rest)
@@ -117,7 +115,7 @@ def parse(function: Callable[..., Any], argv: Sequence[str]) -> tuple[list[Any],
         elif not equals and not free and Parameter.VAR_POSITIONAL in kinds.values():
             words.append(word)
         else:
-            raise ConfigError(f"unknown key {key!r}; {meant(key, fields, '=')}")
+            raise ConfigError(f"unknown key {key!r}; there are {', '.join(fields)}")
 
     @functools.wraps(function)
     def read(*words: Any, **given: Any) -> tuple[list[Any], dict[str, Any]]:
@@ -133,13 +131,6 @@ def parse(function: Callable[..., Any], argv: Sequence[str]) -> tuple[list[Any],
 
 def _home(value: Any) -> Any:
     return value.expanduser() if isinstance(value, Path) else value
-
-
-def meant(word: str, known: Iterable[str], end: str = "") -> str:
-    """The nearest of the known words as a question, else all of them."""
-    known = list(known)
-    near = difflib.get_close_matches(word, known, n=1)
-    return f"did you mean {near[0]}{end}?" if near else f"there are {', '.join(known)}"
 
 
 def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
