@@ -92,7 +92,8 @@ def sample(
 
     int16 where that is enough: 8 MB for a thousand clouds with four samples of 1,024 points.
     """
-    result = np.empty((len(points), starts, count), dtype=_index_type(points.shape[1]))
+    small = points.shape[1] <= np.iinfo(np.int16).max
+    result = np.empty((len(points), starts, count), dtype=np.int16 if small else np.int32)
     for i, stored in enumerate(points):
         cloud = np.asarray(unit_ball(np.asarray(stored)), dtype=np.float32)
         for s, start in enumerate(start_points(stored, starts)):
@@ -104,20 +105,10 @@ def sample_all(
     points: Float[np.ndarray, "n p 3"], count: int, starts: int
 ) -> Int[np.ndarray, "n starts count"]:
     """The same by several threads, with a progress bar on a terminal."""
-    result = np.empty((len(points), starts, count), dtype=_index_type(points.shape[1]))
-    chunks = [slice(i, i + _CHUNK) for i in range(0, len(points), _CHUNK)]
-
-    def fill(chunk: slice) -> None:
-        result[chunk] = sample(np.asarray(points[chunk]), count, starts)
-
+    chunks = [points[i : i + _CHUNK] for i in range(0, len(points), _CHUNK)]
     with ThreadPoolExecutor(len(cores())) as threads:
-        for _ in shown(threads.map(fill, chunks), "sampling points", total=len(chunks)):
-            pass
-    return result
-
-
-def _index_type(points: int) -> type[np.signedinteger]:
-    return np.int16 if points <= np.iinfo(np.int16).max else np.int32
+        parts = threads.map(lambda chunk: sample(np.asarray(chunk), count, starts), chunks)
+        return np.concatenate([*shown(parts, "sampling points", total=len(chunks))])
 
 
 # The cache's file is an .npy with 32 bytes after it: SHA-256 of what it is and of what it holds.
