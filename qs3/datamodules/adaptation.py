@@ -41,6 +41,9 @@ class AdaptationData(LightningDataModule):
 
     Attributes:
         labelled_domain, target_domain: what it is composed of.
+        labelled, validation: clouds of the warm-up, and the held-out ones, after `setup`.
+        all_labelled: both of these, without their labels, likewise.
+        target: its training clouds, likewise.
         pseudo: positions in `target` [m] and their labels [m], or class probabilities [m, C],
             which the rounds train on; None in the warm-up.
     """
@@ -76,30 +79,6 @@ class AdaptationData(LightningDataModule):
         self.batch_size, self.seed = batch_size, seed
         self.pseudo: tuple[Tensor, Tensor] | None = None
 
-    @property
-    def labelled(self) -> Labelled:
-        """The clouds of the warm-up, after `setup`."""
-        assert isinstance(self.labelled_domain.train, Labelled)
-        return self.labelled_domain.train
-
-    @property
-    def all_labelled(self) -> Clouds:
-        """The clouds of the warm-up and the held-out ones, after `setup`."""
-        assert self.labelled_domain.whole is not None
-        return self.labelled_domain.whole
-
-    @property
-    def validation(self) -> Labelled:
-        """Held-out labelled clouds, after `setup`."""
-        assert self.labelled_domain.validation is not None
-        return self.labelled_domain.validation
-
-    @property
-    def target(self) -> Clouds:
-        """The target's training clouds, after `setup`."""
-        assert isinstance(self.target_domain.train, Clouds)
-        return self.target_domain.train
-
     def prepare_data(self) -> None:
         """Make the source if it is to be made, bring published files into the stores, check them.
 
@@ -112,8 +91,15 @@ class AdaptationData(LightningDataModule):
 
     def setup(self, stage: str | None = None) -> None:
         """Load the training clouds of both; for evaluation see `qs3.evaluation.metrics`."""
-        for part in (self.labelled_domain, self.target_domain):
+        labelled, target = self.labelled_domain, self.target_domain
+        for part in (labelled, target):
             part.setup("fit")
+        assert isinstance(labelled.train, Labelled)
+        assert isinstance(target.train, Clouds)
+        assert labelled.whole is not None
+        assert labelled.validation is not None
+        self.labelled, self.validation = labelled.train, labelled.validation
+        self.all_labelled, self.target = labelled.whole, target.train
 
     def set_pseudo_labels(self, index: Tensor, labels: Tensor) -> None:
         """Set `pseudo` for the next round."""
