@@ -92,10 +92,6 @@ class PointClassifier(nn.Module):
         """Logits."""
         return self.head(self.features(points).global_)
 
-    def compile(self, *args: Any, **settings: Any) -> None:
-        """`nn.Module.compile` of the backbone, in place: methods call it by itself."""
-        self.backbone.compile(*args, **settings)
-
 
 def with_head(backbone: Backbone, num_classes: int, **settings: Any) -> PointClassifier:
     """A backbone and a `ClassHead` with these settings."""

@@ -127,9 +127,6 @@ class PointNet2(Backbone):
         self.levels = nn.ModuleList(levels)
         self.last = GroupedMLP(channels, (256, 512, 1024), norm=norm)
 
-    def compile(self, *args: Any, **settings: Any) -> None:
-        """Nothing: torch 2.13's compiler gives other numbers in training, whatever its backend."""
-
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
         """[B, 1024]; there are no features of all N points."""
         xyz, features = points, None

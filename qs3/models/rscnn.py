@@ -9,7 +9,7 @@ d = xj - xi; what it is in code is the switch `relation`:
 - "paper": h as the paper has it, in absolute coordinates, on balls as in "released".
 """
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -145,9 +145,6 @@ class RSCNN(Backbone):
             if self.norm == "instance" and fast.usable(points):
                 return Features(torch.cat([self._forward(cloud[None]) for cloud in points]), None)
             return Features(self._forward(points), None)
-
-    def compile(self, *args: Any, **settings: Any) -> None:
-        """Nothing: torch 2.13's compiler gives other numbers in training, whatever its backend."""
 
     def _forward(self, points: Tensor) -> Tensor:
         features = None

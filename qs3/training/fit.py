@@ -130,14 +130,12 @@ def _classifier(run: Run, method: Method, given: Result | None) -> Classifier:
         metres=cfg.data.scale == "metres",
         regulariser_weight=cfg.protocol.regulariser,
         weights=given.weights if given else None,
-        cuda_graphs=cfg.trainer.get("cuda_graphs", True) and not cfg.compile,
+        cuda_graphs=cfg.trainer.get("cuda_graphs", True),
     )
     if cfg.evaluation.norms != "trained":
         check_has_norms(classifier.net, cfg.evaluation.norms)
     if scheme.rounds and getattr(scheme.selector, "needs_features", False):
         feature_dims(classifier.net)  # before the warm-up, not after it
-    if cfg.compile:
-        classifier.net.compile()  # in place; nets that are only evaluated stay as they are
     return classifier
 
 

@@ -79,7 +79,6 @@ class Settings:
     num_classes: Annotated[int, Ge(2)]
     weights: str | None
     force: Switch
-    compile: Switch
     objective: Literal["entropy", "infomax", "snd"] | None  # none looks at the target's labels
     callbacks: dict[str, Any] | None = None
     logger: dict[str, Any] | None = None

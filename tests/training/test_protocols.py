@@ -1,10 +1,7 @@
-"""Schedules, smoothing, regulariser, precision and compilation in a training."""
+"""Schedules, smoothing, regulariser and precision in a training."""
 
 from __future__ import annotations
 
-import shutil
-
-import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
@@ -82,17 +79,3 @@ def test_means_count_the_steps_of_the_optimiser(toy):
     assert batches % 4 == 2, "an epoch ends within a step"
     assert saved["global_step"] == 2 * -(-batches // 4)
     assert saved["state_dict"]["method.steps"] == saved["global_step"]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("g++") is None, reason="torch's compiler needs g++")
-def test_compiled_training_comes_to_the_same(toy):
-    # dropout is drawn otherwise, so weights are alike and not equal
-    changes = ("selftraining=none", "method=source_only", "protocol.epochs=2")
-    plain, compiled = toy(*changes), toy(*changes, "compile=true")
-    assert run_folder(plain) != run_folder(compiled)
-    assert train(plain).final.n == train(compiled).final.n
-    a, b = (load(run_folder(cfg) / "student.pt") for cfg in (plain, compiled))
-    assert a.keys() == b.keys()  # names of weights stay
-    for name in a:
-        np.testing.assert_allclose(a[name], b[name], atol=0.3, err_msg=name)
