@@ -43,6 +43,7 @@ from qs3.datasets.scannet_files import (
     read_scene_list,
 )
 from qs3.errors import DataError
+from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.store.meta import MadeOf, ManifestRow
 from qs3.utils.files import reading
 from qs3.utils.settings import Count, settings
@@ -256,18 +257,13 @@ def spread(towards_m: Float[np.ndarray, "n 3"], points: Sequence[int], count: in
     """Up to `count` viewpoints, in order: farthest point sampling of their directions.
 
     The first is the frame with most points; each next one is that whose direction from the
-    object is farthest from those of all taken. Of equals the earliest is taken. `towards_m` is from
-    the object's centre to the camera of each frame.
+    object is farthest from those of all taken. `towards_m` is from the object's centre to the
+    camera of each frame.
     """
     length = np.linalg.norm(towards_m, axis=1, keepdims=True)
     directions = towards_m / np.where(length > 0, length, 1.0)
-    chosen = [int(np.argmax(points))]
-    gap = np.full(len(directions), np.inf)
-    while len(chosen) < min(count, len(directions)):
-        gap = np.minimum(gap, np.linalg.norm(directions - directions[chosen[-1]], axis=1))
-        gap[chosen] = -1.0  # also where all stand at one place
-        chosen.append(int(np.argmax(gap)))
-    return chosen
+    first, count = int(np.argmax(points)), min(count, len(directions))
+    return farthest_point_sampling_np(directions, count, first).tolist()
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,9 +113,10 @@ def test_each_next_one_is_the_farthest(seed, n, count):
     unit = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     for k in range(1, len(chosen)):
         gaps = [min(np.linalg.norm(unit[i] - unit[j]) for j in chosen[:k]) for i in range(n)]
-        assert gaps[chosen[k]] >= max(gaps) - 1e-12
+        assert gaps[chosen[k]] >= max(gaps) - 1e-6
 
 
 def test_frames_at_one_place_are_all_taken_once():
-    assert sorted(spread(np.ones((5, 3)), [1, 2, 2, 1, 1], 4)) == [0, 1, 2, 3]
+    chosen = spread(np.ones((5, 3)), [1, 2, 2, 1, 1], 4)
+    assert (chosen[0], len({*chosen})) == (1, 4)
     assert spread(np.zeros((2, 3)), [1, 1], 5) == [0, 1]
