@@ -11,22 +11,21 @@ not said, is whether it is the first of an optimiser's step, which may take seve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
-from annotated_types import Ge, Interval
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
+from qs3.utils.settings import NotNegative
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
     from qs3.models.base import Features
 
-Weight = Annotated[float, Ge(0)]  # of a loss; 0 switches it off
-Share = Annotated[float, Interval(ge=0, le=1)]
+Weight = NotNegative  # of a loss; 0 switches it off
 Batch = dict[str, Any]
 Terms = dict[str, Float[Tensor, ""]]  # of a loss, by name
 

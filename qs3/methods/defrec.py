@@ -18,10 +18,10 @@ from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Batch, Method, Share, Terms, Weight, feature_dims
+from qs3.methods.base import Batch, Method, Terms, Weight, feature_dims
 from qs3.methods.pcm import source_loss
 from qs3.models.base import Features
-from qs3.utils.settings import checked
+from qs3.utils.settings import Share, checked
 
 GRID = 3
 VOXELS = GRID**3

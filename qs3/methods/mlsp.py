@@ -14,10 +14,10 @@ from torch.nn import functional as F
 from qs3.geometry.neighbours import gather, knn
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Batch, Method, Share, Terms, Weight
+from qs3.methods.base import Batch, Method, Terms, Weight
 from qs3.methods.defrec import ReconstructionHead, cloud_size, deform, masked_mean, nearest
 from qs3.methods.pcm import source_loss
-from qs3.utils.settings import checked
+from qs3.utils.settings import Share, checked
 
 CARDINALITIES = 16
 RADIUS = 0.12  # of the ball in which points are counted, in radii of the cloud

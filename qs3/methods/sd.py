@@ -19,8 +19,8 @@ from torch.nn import functional as F
 from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Batch, Method, Share, Terms, Weight, check_taught, class_loss
-from qs3.utils.settings import checked
+from qs3.methods.base import Batch, Method, Terms, Weight, check_taught, class_loss
+from qs3.utils.settings import Share, checked
 
 
 @torch.no_grad()
