@@ -101,10 +101,6 @@ class AdaptationData(LightningDataModule):
         self.labelled, self.validation = labelled.train, labelled.validation
         self.all_labelled, self.target = labelled.whole, target.train
 
-    def set_pseudo_labels(self, index: Tensor, labels: Tensor) -> None:
-        """Set `pseudo` for the next round."""
-        self.pseudo = (index, labels)
-
     def train_dataloader(self) -> Batches:
         """The batches of the current epoch (the trainer asks anew each epoch)."""
         epoch = self.trainer.current_epoch if self.trainer else 0

@@ -57,7 +57,6 @@ class DomainData(LightningDataModule):
         whole: clouds of the training split before it was divided, without their labels; with
             `clouds_a_class` those that it leaves.
         classes: names in label order, after `setup`.
-        sha256: of the dataset, after `setup`.
 
     Raises:
         ConfigError, DataError: no such domain, no clouds for training or of such a scale, no labels
@@ -102,7 +101,6 @@ class DomainData(LightningDataModule):
         self.validation: Labelled | None = None
         self.test: Labelled | Clouds | None = None
         self.classes: tuple[str, ...] = ()
-        self.sha256 = ""
         self._checked = False
         self._epochs = 0  # that have begun without a trainer
 
@@ -118,7 +116,7 @@ class DomainData(LightningDataModule):
         The dataset itself is not kept: it holds all labels.
         """
         dataset = self.domain.open(verify=False)
-        self.classes, self.sha256 = tuple(dataset.classes), dataset.sha256
+        self.classes = tuple(dataset.classes)
         if self.clouds_a_split is not None:
             dataset = dataset.fewer(self.clouds_a_split)
         if stage in (None, "fit", "validate") and self.train is None:

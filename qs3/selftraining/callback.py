@@ -157,9 +157,9 @@ class SelfTraining(Callback):
         labels = torch.from_numpy(teacher.predicted)
         index = torch.from_numpy(selection.selected.nonzero()[0])
         if selection.soft is None:
-            data.set_pseudo_labels(index, labels[index])
+            data.pseudo = (index, labels[index])
         else:
-            data.set_pseudo_labels(index, torch.from_numpy(selection.soft).float()[index])
+            data.pseudo = (index, torch.from_numpy(selection.soft).float()[index])
         self.records.append(self._record(round_, selection, labels, missing))
         self._previous = labels
         if trainer.is_global_zero:

@@ -110,7 +110,7 @@ class StudentSelection(Callback):
             )
         mask = torch.from_numpy(held)
         self.held_out = (index[mask], hard[mask])
-        data.set_pseudo_labels(index[~mask], labels[~mask])
+        data.pseudo = (index[~mask], labels[~mask])
         log.info("round %d: %d pseudo-labelled samples held out", round_, int(held.sum()))
 
     def state_dict(self) -> dict[str, Any]:

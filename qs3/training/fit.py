@@ -8,7 +8,7 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from lightning.pytorch import Callback, Trainer
@@ -61,7 +61,8 @@ def fit(run: Run) -> tuple[Loaded, Built]:
     began = Moment(time.time(), processor_seconds())
     _quieten()
     trainer = run.cfg.trainer
-    settle_process(number_of(trainer.threads), trainer.get("float32_matmul", "highest"))
+    threads = free_cores() if trainer.threads == "auto" else trainer.threads or len(cores())
+    settle_process(threads, trainer.get("float32_matmul", "highest"))
     method: Method = build(run.cfg.method)
     given = read_given(run.cfg)
     loaded = load_data(run, method, given)
@@ -183,13 +184,6 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     if built.trainer.is_global_zero:
         save(copy_weights(built.classifier.net), run.folder / STUDENT)
     built.trainer.strategy.barrier("student saved")
-
-
-def number_of(threads: int | Literal["auto"] | None) -> int:
-    """`trainer.threads` as a number: null is all cores, "auto" those that are free now."""
-    if threads is None:
-        return len(cores())
-    return free_cores() if threads == "auto" else threads
 
 
 def settle_process(threads: int, float32_matmul: str = "highest") -> None:

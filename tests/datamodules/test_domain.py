@@ -137,7 +137,7 @@ def test_epochs_are_a_function_of_seed_and_number_with_and_without_a_trainer(dat
 def test_batches_are_the_clouds_of_the_store(data_dir):
     data = made(data_dir, points=64, fps_starts=1)
     store = open_pointset(data_dir / "specklenet10")
-    assert (data.classes, data.sha256) == (store.classes, store.sha256)
+    assert data.classes == store.classes
     for part, split in ((data.whole, "train"), (data.test, "test")):
         assert part.ids == store.split(split).ids
     assert data.test.labels.tolist() == store.split("test").labels.tolist()
@@ -213,7 +213,6 @@ def test_a_few_clouds_of_each_split_or_class(data_dir, tmp_path):
     plain = clouds_of(made(data_dir).train_dataloader())
     assert torch.equal(clouds_of(cached.train_dataloader()), plain)
     assert torch.equal(clouds_of(again.train_dataloader()), plain)
-    assert few.sha256 == cached.sha256
     assert not list(tmp_path.glob("*.npy"))  # what is cached are whole splits
     assert list((tmp_path / "c").glob("*.npy"))
     whole, first = made(data_dir), made(data_dir, clouds_a_class=5)

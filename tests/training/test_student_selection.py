@@ -169,31 +169,30 @@ def test_a_label_of_no_weight_is_not_held_out(tmp_path):
     callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val")
     soft = torch.zeros(40, 3)
     soft[:20] = torch.eye(3)[torch.arange(20) % 2 + 1]  # rods and slabs, no ball
-    kept = {}
     data = SimpleNamespace(
         pseudo=(torch.arange(40), soft),
         seed=0,
         target=SimpleNamespace(ids=[str(i) for i in range(40)]),
-        set_pseudo_labels=lambda index, labels: kept.update(index=index, labels=labels),
     )
     callback._hold_out(data)
     index, labels = callback.held_out
     assert len(index) >= 2
     assert (index < 20).all()
     assert torch.equal(labels, index % 2 + 1)
-    assert sorted([*index.tolist(), *kept["index"].tolist()]) == list(range(40))
+    assert sorted([*index.tolist(), *data.pseudo[0].tolist()]) == list(range(40))
 
 
 def test_each_process_has_two_to_train_on(tmp_path):
     """Of five of a class one is held out: four are too few for four processes, not for three."""
+    pseudo = (torch.arange(5), torch.zeros(5, dtype=torch.int64))
     data = SimpleNamespace(
-        pseudo=(torch.arange(5), torch.zeros(5, dtype=torch.int64)),
+        pseudo=pseudo,
         seed=0,
         target=SimpleNamespace(ids=[str(i) for i in range(5)]),
-        set_pseudo_labels=lambda index, labels: None,
     )
     callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val")
     callback._hold_out(data, processes=3)
     assert len(callback.held_out[0]) == 1
+    data.pseudo = pseudo
     with pytest.raises(SelectionError, match="pseudo_val"):
         callback._hold_out(data, processes=4)
