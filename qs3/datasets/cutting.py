@@ -21,7 +21,7 @@ from annotated_types import Ge, Gt
 from jaxtyping import Bool, Float, Int
 
 from qs3.datasets.depth_images import DepthImage
-from qs3.datasets.picture_kernels import connected, mean_distance
+from qs3.datasets.picture_kernels import connected
 from qs3.utils.settings import Count, NotNegative, settings
 
 CLEAN, HARD = "clean", "hard"
@@ -33,7 +33,6 @@ _FLOOR_LEAST = 200  # points
 _PLATE = 0.9  # share of the points that must lie in a plate for the object to be flat
 _LEAST_PX = 20  # a piece below is dust: it is joined to nothing
 _MOST_PIECES = 40  # looked at, the largest first
-_REACH_PX = 4  # a pixel's nearest points are among those of the 80 around it
 _SAMPLE = 2000  # points of a piece that the gap to others is measured with
 _FAR = 1e9
 
@@ -118,8 +117,7 @@ class Piece:
 
     Attributes:
         points_m: [n, 3] float32, z up, the camera at the origin; row by row in the picture.
-        inlier: [n] whether a point is near its neighbours, see `Rules.outlier_sds`; all, where few
-            pixels, the rim or what covers it refuse the piece.
+        inlier: [n] whether a point is near its neighbours; see `Rules.outlier_sds`.
         pixels: with depth, that are the object's.
         holes: share of the mask without depth.
         kept: share of the measured pixels that are the object's; the others lie behind or before.
@@ -193,12 +191,8 @@ def cut(
     mask = mask & image.inside
     measured, core = measured_pixels(image, mask, rules, edge_px)
     own = body(pieces(measured, image.depth_m, rules), image.points_m, rules)
-    points, taken = image.points_m[own], own
-    pixels, inlier = len(points), np.ones(len(points), dtype=bool)
-    cut_off, covered = rim(mask, image.inside, rules), occlusion(mask, own, image.depth_m, rules)
-    usable = pixels >= rules.limits_of(cls).pixels
-    if usable and cut_off <= rules.most_rim and covered <= rules.most_occ:
-        inlier = _inliers(image.points_m, own, rules)  # costs most
+    points = image.points_m[own]
+    inlier, pixels, taken = inliers(points, rules), len(points), own
     if rules.drop_outliers:
         taken = own.copy()
         taken[own] = inlier
@@ -210,8 +204,8 @@ def cut(
         piece = replace(
             piece,
             kept=pixels / int(measured.sum()),
-            rim=cut_off,
-            occ=covered,
+            rim=rim(mask, image.inside, rules),
+            occ=occlusion(mask, own, image.depth_m, rules),
             extent_m=(x, y, z),
             depth_m=float(np.median(image.depth_m[own])),
         )
@@ -350,13 +344,13 @@ def occlusion(
     return float((nearest < object_depth - jump).mean())
 
 
-def _inliers(
-    points_m: Float[np.ndarray, "h w 3"], own: Bool[np.ndarray, "h w"], rules: Rules
-) -> Bool[np.ndarray, " n"]:
-    mean = mean_distance(points_m, own, rules.neighbours, _REACH_PX)[own]
-    alone = np.isinf(mean)
-    least = mean[~alone]
-    near: Bool[np.ndarray, " n"] = mean <= least.mean() + rules.outlier_sds * least.std()
+def inliers(points_m: Float[np.ndarray, "n 3"], rules: Rules) -> Bool[np.ndarray, " n"]:
+    """Whether each point's mean distance to its neighbours is like the others'."""
+    if len(points_m) <= rules.neighbours or not rules.outlier_sds:
+        return np.ones(len(points_m), dtype=bool)
+    distance, _ = scipy.spatial.cKDTree(points_m).query(points_m, k=rules.neighbours + 1)
+    mean = distance[:, 1:].mean(axis=1)
+    near: Bool[np.ndarray, " n"] = mean <= mean.mean() + rules.outlier_sds * mean.std()
     return near
 
 

@@ -1,7 +1,5 @@
 """What `cutting` does pixel by pixel, compiled."""
 
-import math
-
 import numpy as np
 
 from qs3.utils.processor import compiled
@@ -54,44 +52,3 @@ def connected(
             else:  # the first pixel of a piece comes first
                 number[i, j] = number[root // width, root % width]
     return number
-
-
-@compiled
-def mean_distance(points_m: np.ndarray, own: np.ndarray, neighbours: int, reach: int) -> np.ndarray:
-    """[h, w] float32 mean distance of each own pixel's point to its nearest ones; 0 elsewhere.
-
-    Nearest are those of the own pixels at most `reach` rows and columns away; where there are
-    fewer than `neighbours`, the missing ones count as twice as far as the farthest.
-    """
-    height, width = own.shape
-    out = np.zeros((height, width), dtype=np.float32)
-    best = np.empty(neighbours, dtype=np.float64)
-    for i in range(height):
-        for j in range(width):
-            if not own[i, j]:
-                continue
-            count = 0
-            x, y, z = points_m[i, j, 0], points_m[i, j, 1], points_m[i, j, 2]
-            for a in range(max(i - reach, 0), min(i + reach + 1, height)):
-                for b in range(max(j - reach, 0), min(j + reach + 1, width)):
-                    if not own[a, b] or (a == i and b == j):
-                        continue
-                    dx, dy, dz = points_m[a, b, 0] - x, points_m[a, b, 1] - y, points_m[a, b, 2] - z
-                    square = dx * dx + dy * dy + dz * dz
-                    if count < neighbours:
-                        place = count
-                        count += 1
-                    elif square < best[neighbours - 1]:
-                        place = neighbours - 1
-                    else:
-                        continue
-                    while place > 0 and best[place - 1] > square:
-                        best[place] = best[place - 1]
-                        place -= 1
-                    best[place] = square
-            total = 0.0
-            for k in range(count):
-                total += math.sqrt(best[k])
-            far = 2 * math.sqrt(best[count - 1]) if count else math.inf
-            out[i, j] = (total + (neighbours - count) * far) / neighbours if count else math.inf
-    return out

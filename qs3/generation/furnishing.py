@@ -104,7 +104,8 @@ class Furnishing:
             for the classes that are not here.
         least_m, most_m: sides of the room.
         things: fewest and most things with a class.
-        shared_top: probability that a thing on furniture shares what is there already.
+        shared_top: probability that a thing on furniture shares what is there already, with a top
+            at `shared_m`.
         seats: the most chairs without a class at a table; the number is uniform.
         clutter: the most boxes and cylinders on the floor; the number is uniform.
         thing_m, clutter_m: their sides and heights, on furniture and on the floor.
@@ -118,6 +119,7 @@ class Furnishing:
     most_m: Range = (6.5, 6.0)
     things: tuple[int, int] = (10, 25)
     shared_top: Share = 0.6
+    shared_m: Range = (0.5, 1.3)
     seats: Most = 3
     clutter: Most = 4
     thing_m: Range = (0.06, 0.4)
@@ -186,18 +188,19 @@ class Furnishing:
         return Furnished(room.size, room.things, room.others, _shell(room.size))
 
     def _at_table(self, room: "_Room", mesh: Mesh) -> "_Pose | None":
-        """Drawn up to one of the room's tables; the first one gets a table without a class."""
+        """Drawn up to one of the room's tables; where all are full, to one without a class."""
         rng = room.rng
-        if not room.tables:
-            half = rng.uniform(*self.table_m, 2) / 2
-            board = table((-half, half), np.eye(2), 0.0, rng.uniform(*self.top_m), 0.06, 0.05)
-            pose = room.anywhere(board) if rng.random() < 0.6 else room.at_wall(board)
-            if pose is None:
-                return None
-            room.others.append(pose.of(board))
-            room.tables.append(pose.outline(board))
-            room.carriers.append(_Top.of(room.others[-1], rng, 6))
-        return room.drawn_up(mesh, room.tables)
+        if room.tables and (pose := room.drawn_up(mesh, room.tables)) is not None:
+            return pose
+        half = rng.uniform(*self.table_m, 2) / 2
+        board = table((-half, half), np.eye(2), 0.0, rng.uniform(*self.top_m), 0.06, 0.05)
+        place = room.anywhere(board) if rng.random() < 0.6 else room.at_wall(board)
+        if place is None:
+            return None
+        room.others.append(place.of(board))
+        room.tables.append(place.outline(board))
+        room.carriers.append(_Top.of(room.others[-1], rng, 6))
+        return room.drawn_up(mesh, room.tables[-1:])
 
     def _on_top(self, room: "_Room", mesh: Mesh, habits: Habits) -> "_Pose | None":
         """On what is there, turned to the middle of the room, or on a stand of its own."""
@@ -206,7 +209,7 @@ class Furnishing:
         if room.carriers and rng.random() < self.shared_top:
             for _ in range(4):
                 top = room.carriers[int(rng.integers(len(room.carriers)))]
-                spot = top.spot(0.7 * radius, rng, (0.35, 1.45))
+                spot = top.spot(0.7 * radius, rng, self.shared_m)
                 if spot is not None:
                     ahead = room.size / 2 - spot[:2]
                     yaw = np.arctan2(ahead[1], ahead[0]) + np.pi / 2 + rng.normal(0, 0.5)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 from pydantic import InstanceOf
 
-from qs3.datasets.cutting import Rules, cut, measured_pixels, pieces
+from qs3.datasets.cutting import Rules, cut, inliers, measured_pixels, pieces
 from qs3.datasets.depth_images import DepthImage, Pinhole
 from qs3.generation.camera_poses import direction
 from qs3.generation.furnishing import Furnished, Furnishing, Thing
@@ -97,7 +97,9 @@ class Rooms:
             that is not here.
         mask: how carelessly masks are drawn; its box is not used, nor its `margin_m`.
         rules: by which things are cut, and when they are refused.
-        points: of a cloud; a smaller one repeats points.
+        drawn: at most so many of an object's pixels, at random and without outliers, as archives of
+            cut objects hold.
+        points: of a cloud, the farthest of these; a smaller one repeats points.
         by_class: probability that a picture has masks of classes and not of things, as NYU Depth V2
             has: what depth edges part is several objects then, and what touches is one.
         worktops: by class the probability that its top is not its own, as where kitchens' worktops
@@ -113,6 +115,7 @@ class Rooms:
     shares: Mapping[str, NotNegative] = field(default_factory=dict)
     mask: InstanceOf[MaskCrop] = field(default_factory=MaskCrop)
     rules: InstanceOf[Rules] = field(default_factory=Rules)
+    drawn: Count = 2048
     points: Count = 1024
     by_class: Share = 0.5
     worktops: Mapping[str, Share] = field(default_factory=dict)
@@ -169,8 +172,11 @@ class Rooms:
             for thing, points in self._cut(frame, pose, things, full, rng):
                 if counts[thing.cls] < self.most * share[thing.cls]:
                     counts[thing.cls] += 1
-                    clouds.append(points[farthest_point_sampling_np(points, self.points)])
                     found.append(Found(thing.cls, thing.item.origin, thing.sha256, len(points)))
+                    few = min(self.drawn, len(points))
+                    points = points[np.sort(rng.choice(len(points), few, replace=False))]
+                    points = points[inliers(points, self.rules)]
+                    clouds.append(points[farthest_point_sampling_np(points, self.points)])
         return Cloud({"points": np.stack(clouds)} if clouds else {}, 1, 0, (), tuple(found))
 
     def _cut(
@@ -194,7 +200,8 @@ class Rooms:
                 [k for k in range(len(names)) if names[k] == cls] for cls in dict.fromkeys(names)
             ]
         for group in groups:
-            cls, rules = things[group[0]].cls, self.rules
+            cls = things[group[0]].cls
+            rules = replace(self.rules, outlier_sds=0.0)  # looked for among the few that are drawn
             if cls in full or pixels[group].sum() < rules.limits_of(cls).pixels:
                 continue
             seen = np.isin(frame.label, np.array(group) + 1)

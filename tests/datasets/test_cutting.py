@@ -9,12 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from qs3.datasets.cutting import Limits, Rules, body, cut, occlusion, pieces, rim
 from qs3.datasets.depth_images import DepthImage, Pinhole, upright
 from qs3.datasets.nyuv2 import AREA
-from qs3.datasets.picture_kernels import mean_distance
 from tests.fixtures.frame_files import Shot, Thing, kinect
 
 
@@ -84,20 +82,6 @@ def test_pieces_are_those_of_a_graph(seed, full):
     own, theirs = number[measured], label.reshape(depth.shape)[measured]
     np.testing.assert_array_equal(own[:, None] == own, theirs[:, None] == theirs)
     assert (np.diff(np.bincount(own)) <= 0).all() if len(own) else True  # the largest first
-
-
-def test_mean_distances_are_those_of_a_tree():
-    """Twin: of a smooth surface, the nearest points are those of pixels nearby."""
-    rng = np.random.default_rng(0)
-    v, u = np.mgrid[:40, :50]
-    points = np.stack([0.01 * u, 0.012 * v, 2 + 0.2 * np.sin(u / 9) + 0.001 * rng.random(u.shape)])
-    points, own = np.moveaxis(points, 0, -1), rng.random(u.shape) < 0.9
-    mean = mean_distance(points, own, 12, 4)[own]
-    theirs, _ = cKDTree(points[own]).query(points[own], k=13)
-    np.testing.assert_allclose(mean, theirs[:, 1:].mean(axis=1), rtol=1e-6)
-    alone = np.zeros_like(own)
-    alone[3, 3] = True
-    assert np.isinf(mean_distance(points, alone, 12, 4)[3, 3])
 
 
 LEVEL = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.catalogue import Catalogue
@@ -130,6 +130,7 @@ def test_a_class_without_habits_has_the_default_ones():
     assert (law.of("cup").top, law.of("chest").wall, Furnishing().of("cup")) == (1, 1, Habits())
 
 
+@settings(max_examples=5)
 @given(seed=SEEDS)
 def test_rooms_of_the_catalogue_are_full(seed):
     items = Catalogue(seed=1, train=2, test=0).items()

@@ -15,14 +15,15 @@ from qs3.generation.command import generate
 from qs3.generation.furnishing import Furnished, Thing
 from qs3.generation.kept import Keep
 from qs3.generation.plan import planned
-from qs3.generation.rooms import RoomCamera, one_piece
+from qs3.generation.rooms import RoomCamera, _Shelf, parts
 from qs3.geometry.cameras import Camera, Intrinsics, project
 from qs3.store.store import open_pointset
+from qs3.utils.seeding import object_rng
 from tests.generation.generating import composed
 
 LENS = Intrinsics.centred(640, 480, 580.0)
 ID = "room/train/room_000003"
-ROOMS = ("domain=roomscan10", "limit=3", "rooms=0.1")
+ROOMS = ("domain=rooms10", "limit=3", "rooms=0.1")
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,7 @@ def made():
     plan = planned(composed(*ROOMS))
     # Careful masks of whole objects: each point then lies on its object.
     exact = replace(plan.recipe.mask, min_grow_px=0, max_grow_px=0, max_shift_px=0)
-    recipe, renderer = replace(plan.recipe, mask=exact, torn=0.0), build(plan.cfg.renderer)
+    recipe, renderer = replace(plan.recipe, mask=exact, by_class=0.0), build(plan.cfg.renderer)
     cloud = recipe.make("train", ID, 0, renderer)
     return SimpleNamespace(recipe=recipe, renderer=renderer, cloud=cloud)
 
@@ -94,33 +95,32 @@ def test_the_same_room_whatever_was_made_before_or_is_kept(made):
 
 
 def test_a_worktop_is_not_its_cabinet_s(made):
-    def tops(worktops):
-        recipe = replace(made.recipe, worktops=worktops)
-        found = [recipe.make("train", f"room/train/room_{k}", 0, made.renderer) for k in range(3)]
-        return [
-            points[:, 2].max()
-            for cloud in found
-            for of, points in zip(cloud.found, cloud.arrays.get("points", ()), strict=True)
-            if of.cls == "cabinet"
-        ]
-
-    kept, lost = tops({}), tops({"cabinet": 1.0})
-    assert kept
-    assert np.mean(lost) < np.mean(kept) - 0.02
+    recipe, lost = replace(made.recipe, worktops={"cabinet": 1.0}), []
+    for room_id in (f"room/train/room_{k}" for k in range(4)):
+        shelf = _Shelf(recipe.shelves["train"], recipe.shares)
+        room = recipe.furnishing.furnish(shelf.draw, object_rng(0, room_id, 0))
+        tops = {thing.sha256: thing.mesh.bounds[1, 2] for thing in room.things}
+        cloud = recipe.make("train", room_id, 0, made.renderer)
+        for of, points in zip(cloud.found, cloud.arrays["points"], strict=True):
+            if of.cls == "cabinet":
+                lost.append(max(tops[of.mesh_sha256] - points[:, 2].max(), 0))
+    assert lost
+    assert min(lost) > 0.03
 
 
-def test_a_piece_is_drawn_among_those_that_are_large_enough():
+def test_depth_edges_part_a_class_into_objects():
     depth = np.full((40, 90), 2.0)
     depth[:, 30:60] = 3.0
-    own = np.ones(depth.shape, bool)
-    own[:, 88:] = False
-    depth[:, 85:] = 1.0  # three columns: 120 pixels
+    mask = np.ones(depth.shape, bool)
+    depth[:, 85:] = 1.0  # five columns: 200 pixels
     image = DepthImage(depth, Pinhole(500, 500, 45, 20), np.eye(3))
-    rules = Rules(limits={"chair": Limits(pixels=500)})
-    rng = np.random.default_rng(0)
-    sums = {int(one_piece(image, own, "chair", rules, rng).sum()) for _ in range(50)}
-    assert sums == {1000, 1200}
-    assert one_piece(image, own, "default", rules, rng).sum() == 1200  # none is: the largest
+    rules = Rules(erode_px=0, limits={"chair": Limits(pixels=1100), "lamp": Limits(pixels=5000)})
+    found = [
+        np.unique(np.nonzero(part)[1])[[0, -1]].tolist()
+        for part in parts(image, mask, "chair", rules)
+    ]
+    assert found == [[0, 29], [30, 59]]  # of 25 columns the third has 1,000 pixels
+    assert not list(parts(image, mask, "lamp", rules))
 
 
 def test_a_dataset_of_rooms_is_the_same_for_any_number_of_workers(tmp_path):
@@ -131,7 +131,7 @@ def test_a_dataset_of_rooms_is_the_same_for_any_number_of_workers(tmp_path):
         for workers in (0, 2)
     )
     assert a.sha256 == b.sha256
-    data = open_pointset(tmp_path / "0" / "roomscan10")
+    data = open_pointset(tmp_path / "0" / "rooms10")
     assert set(data.splits) == {"train", "test"}
     assert len(set(data.ids)) == len(data) > 10
     order = [data.ids[i].split("/")[0] for i in range(len(data))]
