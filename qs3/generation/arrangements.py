@@ -22,7 +22,7 @@ _CHAIR_M = (0.38, 0.55)
 _SEAT_M = (0.42, 0.5)
 _BACK_M = (0.75, 1.05)
 """Chairs that only hide things: width and depth, height of the seat and of the back."""
-_CELL_M = 0.04
+CELL_M = 0.04
 _SAMPLES = 20_000
 _FLAT_M = 0.03
 """Under a thing the surface differs by no more than this: a board or a mattress, no pillows."""
@@ -82,14 +82,7 @@ class Arrangement:
 
     def _chair(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
         """Before one side of the object's footprint, its seat up to two thirds within it."""
-        side = rng.uniform(*_CHAIR_M)
-        seat, back = rng.uniform(*_SEAT_M), rng.uniform(*_BACK_M)
-        outline = table(
-            (np.full(2, -side / 2), np.full(2, side / 2)), np.eye(2), 0.0, seat, 0.05, 0.035
-        )
-        panel = rectangle(np.array([-side / 2, -side / 2]), np.array([-side / 2 + 0.04, side / 2]))
-        gap = 0.0 if rng.random() < 0.6 else 0.15  # between the seat and the back
-        chair = merge([outline, prism(panel, seat + gap + HAIR_M, back)])
+        chair, side = plain_chair(rng)
         flat = mesh.vertices[:, :2] - mesh.bounds.mean(axis=0)[:2]
         yaw = rng.uniform(0, 2 * np.pi)
         ahead = -np.array([np.cos(yaw), np.sin(yaw)])  # from the chair to the object
@@ -145,10 +138,22 @@ class Arrangement:
             if not len(free):
                 continue
             cell = free[int(spot[0] * len(free))]
-            ring = ring_of(size[:2], sides, yaw) + low + (cell + 0.5) * _CELL_M
+            ring = ring_of(size[:2], sides, yaw) + low + (cell + 0.5) * CELL_M
             bottom = float(heights[tuple(cell)]) + HAIR_M
             found.append(prism(ring, bottom, bottom + float(size[2])))
         return found
+
+
+def plain_chair(rng: np.random.Generator) -> tuple[Mesh, float]:
+    """A seat on four legs with a back at -x, about the z axis, and the seat's side."""
+    side = rng.uniform(*_CHAIR_M)
+    seat, back = rng.uniform(*_SEAT_M), rng.uniform(*_BACK_M)
+    outline = table(
+        (np.full(2, -side / 2), np.full(2, side / 2)), np.eye(2), 0.0, seat, 0.05, 0.035
+    )
+    panel = rectangle(np.array([-side / 2, -side / 2]), np.array([-side / 2 + 0.04, side / 2]))
+    gap = 0.0 if rng.random() < 0.6 else 0.15  # between the seat and the back
+    return merge([outline, prism(panel, seat + gap + HAIR_M, back)]), side
 
 
 def heights_of(
@@ -160,7 +165,7 @@ def heights_of(
     """
     points = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
     low = mesh.bounds[0, :2]
-    cells = ((points[:, :2] - low) / _CELL_M).astype(int)
+    cells = ((points[:, :2] - low) / CELL_M).astype(int)
     heights = np.full(cells.max(axis=0) + 1, -np.inf)
     np.maximum.at(heights, (cells[:, 0], cells[:, 1]), points[:, 2])
     return low, heights
@@ -170,7 +175,7 @@ def flat_within(heights: Float[np.ndarray, "x y"], radius_m: float) -> np.ndarra
     """[x, y] bool: where all cells within `radius_m` are there and of nearly one height."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    reach = max(round(radius_m / _CELL_M), 1)
+    reach = max(round(radius_m / CELL_M), 1)
     # What lies outside the grid is as what shows nothing.
     lowest = minimum_filter(heights, 2 * reach + 1, mode="constant", cval=-np.inf)
     highest = maximum_filter(heights, 2 * reach + 1, mode="constant", cval=-np.inf)

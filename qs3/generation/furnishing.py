@@ -15,22 +15,15 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Float
 
+from qs3.generation.arrangements import CELL_M, flat_within, heights_of, plain_chair
 from qs3.generation.scenes import HAIR_M, prism, rectangle, ring_of, table
-from qs3.geometry.sampling import surface_sample
-from qs3.meshes.mesh import Mesh, MeshItem, merge
+from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.meshes.placement import RealSize
 from qs3.utils.settings import Positive, Share, settings
 
-_CELL_M = 0.05  # of the map of the floor
-_TOP_CELL_M = 0.04  # of maps of furniture from above
-_SAMPLES = 10_000  # points of such a map
-_FLAT_M = 0.03
-"""Under a thing the surface differs by no more than this: a board or a mattress, no pillows."""
+_FLOOR_CELL_M = 0.05  # of the map of the floor
 _WALL_M = 2.6
 _TRIES = 12
-_CHAIR_M, _SEAT_M, _BACK_M = (0.38, 0.55), (0.42, 0.5), (0.75, 1.05)
-"""Chairs without a class: width and depth, height of the seat and of the back."""
-
 Range = tuple[Positive, Positive]
 Most = Annotated[int, Ge(0)]
 
@@ -175,7 +168,7 @@ class Furnishing:
                 room.tables.append(pose.outline(mesh))
         for outline in room.tables:
             for _ in range(int(rng.integers(0, self.seats + 1))):
-                chair = _chair(rng)
+                chair = _Pose(-np.pi / 2, np.zeros(2)).of(plain_chair(rng)[0])  # its back at +y
                 if (pose := room.drawn_up(chair, [outline])) is not None:
                     room.others.append(pose.of(chair))
         for top in room.carriers:
@@ -262,7 +255,7 @@ class _Room:
         self.others: list[Mesh] = []
         self.tables: list[np.ndarray] = []
         self.carriers: list[_Top] = []
-        self._taken = np.zeros((size / _CELL_M).astype(int) + 1, dtype=np.uint8)
+        self._taken = np.zeros((size / _FLOOR_CELL_M).astype(int) + 1, dtype=np.uint8)
 
     def anywhere(self, mesh: Mesh) -> _Pose | None:
         for _ in range(_TRIES):
@@ -316,7 +309,7 @@ class _Room:
 
     def _cells(self, ring: np.ndarray) -> np.ndarray:
         cells = np.zeros(self._taken.shape, dtype=np.uint8)
-        corners = np.rint(ring / _CELL_M).astype(np.int32)[:, ::-1]
+        corners = np.rint(ring / _FLOOR_CELL_M).astype(np.int32)[:, ::-1]
         cv2.fillConvexPoly(cells, np.ascontiguousarray(corners), (1,))
         return cells.astype(bool)
 
@@ -331,39 +324,26 @@ class _Top:
 
     @staticmethod
     def of(mesh: Mesh, rng: np.random.Generator, most: int) -> "_Top":
-        points = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
-        low = points[:, :2].min(axis=0)
-        cells = ((points[:, :2] - low) / _TOP_CELL_M).astype(int)
-        heights = np.full(cells.max(axis=0) + 1, -np.inf)
-        np.maximum.at(heights, (cells[:, 0], cells[:, 1]), points[:, 2])
-        return _Top(low, heights, most)
+        return _Top(*heights_of(mesh, rng), most)
 
     def spot(
         self, radius_m: float, rng: np.random.Generator, between_m: Range = (0.0, np.inf)
     ) -> np.ndarray | None:
         """[3] a place where all within `radius_m` is flat and at a height between; takes it."""
-        from scipy.ndimage import maximum_filter, minimum_filter
-
-        reach = 2 * max(round(radius_m / _TOP_CELL_M), 1) + 1
-        # What lies outside the map is as what shows nothing.
-        lowest = minimum_filter(self.heights, reach, mode="constant", cval=-np.inf)
-        highest = maximum_filter(self.heights, reach, mode="constant", cval=-np.inf)
-        with np.errstate(invalid="ignore"):
-            flat = np.isfinite(lowest) & (highest - lowest < _FLAT_M)
-        flat &= (self.heights >= between_m[0]) & (self.heights <= between_m[1])
-        free = np.argwhere(flat)
+        high = (self.heights >= between_m[0]) & (self.heights <= between_m[1])
+        free = np.argwhere(flat_within(self.heights, radius_m) & high)
         if not len(free):
             return None
         cell = free[int(rng.integers(len(free)))]
-        at = self.low + (cell + 0.5) * _TOP_CELL_M
+        at = self.low + (cell + 0.5) * CELL_M
         height = self.heights[tuple(cell)]
         self.fill(at, radius_m)
         return np.array([*at, height])
 
     def fill(self, at: np.ndarray, radius_m: float) -> None:
         """Something stands there now."""
-        reach = int(np.ceil(radius_m / _TOP_CELL_M))
-        middle = ((at - self.low) / _TOP_CELL_M).astype(int)
+        reach = int(np.ceil(radius_m / CELL_M))
+        middle = ((at - self.low) / CELL_M).astype(int)
         self.heights[tuple(slice(max(k - reach, 0), k + reach + 1) for k in middle)] = -np.inf
 
     def things(self, rng: np.random.Generator, size_m: Range) -> list[Mesh]:
@@ -387,16 +367,6 @@ def _loaded(item: MeshItem, placing: RealSize) -> tuple[Mesh, str]:
 
 def _sides(mesh: Mesh) -> np.ndarray:
     return np.ptp(mesh.bounds[:, :2], axis=0)
-
-
-def _chair(rng: np.random.Generator) -> Mesh:
-    """A seat on four legs with a back, its front along -y."""
-    half, seat = rng.uniform(*_CHAIR_M) / 2, rng.uniform(*_SEAT_M)
-    outline = np.full(2, half)
-    legs = table((-outline, outline), np.eye(2), 0.0, seat, 0.05, 0.035)
-    panel = rectangle(np.array([-half, half - 0.04]), outline)
-    gap = 0.0 if rng.random() < 0.6 else 0.15  # between the seat and the back
-    return merge([legs, prism(panel, seat + gap + HAIR_M, rng.uniform(*_BACK_M))])
 
 
 def _shell(size: np.ndarray) -> list[Mesh]:

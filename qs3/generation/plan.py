@@ -155,8 +155,9 @@ class Plan:
         """What is scanned one by one: the objects or, furnished with them, rooms."""
         if not isinstance(self.recipe, Rooms):
             return self.items
+        load: Any = {split: partial(str, split) for split in SPLITS}  # of a room its split
         return [
-            MeshItem(f"room/{split}/room_{k:06d}", "", split, partial(_itself, split), "")
+            MeshItem(f"room/{split}/room_{k:06d}", "", split, load[split], "")
             for split, meshes in self.recipe.shelves.items()
             for k in range(math.ceil(self.cfg.rooms * len(meshes)))
         ]
@@ -282,11 +283,6 @@ class Plan:
             if recipe["objects"] == part and plan_hash(full) == stated.plan_sha256:
                 return f"{name}, {' and '.join(splits)}"
         return f"like {name}, but not it (other settings or objects)"
-
-
-def _itself(split: str) -> Any:
-    """In place of a mesh, what a room is made of."""
-    return split
 
 
 def planned(cfg: DictConfig) -> Plan:

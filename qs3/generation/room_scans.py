@@ -36,6 +36,7 @@ _BARE = Keep()
 _AROUND_M = 0.3
 """The picture is taken so far around the object, for what covers its outline."""
 _WORKTOP_M = 0.05
+_WHOLE = (slice(0, None), slice(0, None))
 
 
 @settings
@@ -72,9 +73,24 @@ class RoomCamera:
             azimuth = front_rad + np.deg2rad(self.side_deg) * (azimuth / np.pi - 1)
         height = rng.uniform(self.min_height_m, self.max_height_m)
         eye = np.array([*(middle[:2] + away * direction(azimuth, 0.0)[:2]), height])
+        return self.looking(rng, eye, middle, away, azimuth, lens)
+
+    def looking(
+        self,
+        rng: np.random.Generator,
+        eye: np.ndarray,
+        middle: np.ndarray,
+        away: float,
+        azimuth: float,
+        lens: Intrinsics,
+    ) -> np.ndarray:
+        """[4, 4] world_from_camera at `eye` [3], `middle` [3] somewhere in the picture.
+
+        `eye` stands `away` from it along the floor, in the direction `azimuth`.
+        """
         half = np.array([lens.width_px, lens.height_px]) / (2 * lens.focal_px)
         right, down = np.arctan(rng.uniform(-self.spread, self.spread, 2) * half)
-        pitch = np.arctan2(height - middle[2], away) - down
+        pitch = np.arctan2(eye[2] - middle[2], away) - down
         low, high = np.deg2rad([self.min_pitch_deg, self.max_pitch_deg])
         ahead = direction(azimuth + np.pi + right, -float(np.clip(pitch, low, high)))
         pose = look_at(eye, eye + ahead)
@@ -240,12 +256,17 @@ def one_piece(
     return number == (rng.choice(enough) if len(enough) else 0)
 
 
-def depth_image(frame: DepthFrame, world_from_camera: np.ndarray) -> DepthImage:
-    """A frame as `qs3.datasets.frames` sees one: its window as the picture, the pose's rotation."""
+def depth_image(
+    frame: DepthFrame, world_from_camera: np.ndarray, window: tuple[slice, slice] = _WHOLE
+) -> DepthImage:
+    """Rows and columns of a frame as `qs3.datasets.frames` sees a picture, with its rotation."""
     lens, step = frame.camera.intrinsics, frame.step_px
-    focal = lens.focal_px / step
+    focal, (rows, columns) = lens.focal_px / step, window
     camera = Pinhole(
-        focal, focal, (lens.cx_px - frame.left) / step, (lens.cy_px - frame.top) / step
+        focal,
+        focal,
+        (lens.cx_px - frame.left) / step - columns.start,
+        (lens.cy_px - frame.top) / step - rows.start,
     )
-    depth = np.nan_to_num(frame.depth_m, nan=0.0)
+    depth = np.nan_to_num(frame.depth_m[window], nan=0.0)
     return DepthImage(depth, camera, world_from_camera[:3, :3])

@@ -14,13 +14,13 @@ from jaxtyping import Bool
 from pydantic import InstanceOf
 
 from qs3.datasets.cutting import Rules, cut, inliers, measured_pixels, pieces
-from qs3.datasets.depth_images import DepthImage, Pinhole
+from qs3.datasets.depth_images import DepthImage
 from qs3.generation.camera_poses import direction
 from qs3.generation.furnishing import Furnished, Furnishing, Thing
 from qs3.generation.kept import Keep
-from qs3.generation.materials import LightAbove, MixedMaterials
 from qs3.generation.recipes import Cloud, Found, MaskCrop
-from qs3.geometry.cameras import Camera, Intrinsics, look_at
+from qs3.generation.room_scans import RoomCamera, depth_image
+from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.meshes.mesh import MeshItem
 from qs3.meshes.placement import RealSize
@@ -39,21 +39,16 @@ _MOST_THINGS = 250  # labels of pixels have 8 bits
 
 
 @settings
-class RoomCamera:
-    """Somebody stands in a room and holds a camera so that a thing is somewhere in the picture."""
+class StandingCamera(RoomCamera):
+    """Somebody stands in a furnished room.
 
-    min_height_m: float = 1.1  # above the floor
-    max_height_m: float = 1.7
-    min_distance_m: Positive = 1.3  # along the floor, from the thing's middle
-    max_distance_m: Positive = 4.5
-    small_m: Positive = 0.35  # both distances shrink with things whose largest side is below
-    clearance_m: NotNegative = 0.6  # at least, from the circle around the thing's footprint
-    spread: Share = 0.85  # of the picture's half width and height, within which its middle lies
-    min_pitch_deg: float = -5.0  # how far the camera looks down
-    max_pitch_deg: float = 40.0
-    roll_deg: NotNegative = 1.5  # standard deviation
+    Attributes:
+        small_m: distances shrink with things whose largest side is below.
+    """
 
-    def pose(
+    small_m: Positive = 0.35
+
+    def before(
         self, rng: np.random.Generator, thing: Thing, room: Furnished, lens: Intrinsics
     ) -> np.ndarray | None:
         """[4, 4] world_from_camera; None where there is no place to stand."""
@@ -62,7 +57,6 @@ class RoomCamera:
         radius, near = float(np.hypot(*sides[:2])) / 2, min(1.0, sides.max() / self.small_m)
         standing = [*(t.mesh for t in room.things), *room.others]
         low, high = np.stack([mesh.bounds for mesh in standing]).transpose(1, 0, 2)
-        half = np.array([lens.width_px, lens.height_px]) / (2 * lens.focal_px)
         for _ in range(_STANDS):
             away = near * rng.uniform(self.min_distance_m, self.max_distance_m)
             away, azimuth = max(away, radius + near * self.clearance_m), rng.uniform(0, 2 * np.pi)
@@ -70,16 +64,8 @@ class RoomCamera:
             eye = np.array([*(middle[:2] + away * direction(azimuth, 0.0)[:2]), height])
             inside = (eye[:2] > _FROM_WALL_M) & (eye[:2] < room.size_m - _FROM_WALL_M)
             hit = ((eye > low - _APART_M) & (eye < high + _APART_M)).all(axis=1).any()
-            if hit or not inside.all():
-                continue
-            right, down = np.arctan(rng.uniform(-self.spread, self.spread, 2) * half)
-            pitch = np.arctan2(height - middle[2], away) - down
-            pitch = float(np.clip(pitch, *np.deg2rad([self.min_pitch_deg, self.max_pitch_deg])))
-            pose = look_at(eye, eye + direction(azimuth + np.pi + right, -pitch))
-            roll = np.deg2rad(rng.normal(0, self.roll_deg))
-            c, s = np.cos(roll), np.sin(roll)
-            pose[:3, :3] = pose[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-            return pose
+            if inside.all() and not hit:
+                return self.looking(rng, eye, middle, away, azimuth, lens)
         return None
 
 
@@ -104,13 +90,12 @@ class Rooms:
             has: what depth edges part is several objects then, and what touches is one.
         worktops: by class the probability that its top is not its own, as where kitchens' worktops
             are labelled as counters.
-        materials, light: as in `Mesh2Point`.
         shelves: the meshes that rooms of a split are furnished from.
     """
 
     sensor: InstanceOf[DepthSensor]
     furnishing: InstanceOf[Furnishing] = field(default_factory=Furnishing)
-    camera: InstanceOf[RoomCamera] = field(default_factory=RoomCamera)
+    camera: InstanceOf[StandingCamera] = field(default_factory=StandingCamera)
     most: Count = 4
     shares: Mapping[str, NotNegative] = field(default_factory=dict)
     mask: InstanceOf[MaskCrop] = field(default_factory=MaskCrop)
@@ -119,8 +104,6 @@ class Rooms:
     points: Count = 1024
     by_class: Share = 0.5
     worktops: Mapping[str, Share] = field(default_factory=dict)
-    materials: InstanceOf[MixedMaterials] | None = None
-    light: LightAbove | None = None
     shelves: Mapping[str, tuple[InstanceOf[MeshItem], ...]] = field(default_factory=dict)
     views: Count = 10
     needs_renderer: bool = True
@@ -131,12 +114,7 @@ class Rooms:
         return self.furnishing.placing
 
     def make(
-        self,
-        split: str,
-        room_id: str,
-        seed: int,
-        renderer: Renderer | None,
-        keep: Keep = _BARE,
+        self, split: str, room_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
         """The clouds of one room, which is furnished from the meshes of a split."""
         assert renderer is not None
@@ -145,8 +123,6 @@ class Rooms:
         things = room.things[:_MOST_THINGS]
         others = [Body(mesh, label=0) for mesh in (*room.others, *room.shell)]
         bodies = (*(Body(thing.mesh, label=1 + k) for k, thing in enumerate(things)), *others)
-        if self.materials is not None:
-            bodies = self.materials.dress(bodies, object_rng(seed, room_id, 0, 1))
         clouds: list[np.ndarray] = []
         found: list[Found] = []
         counts, looks = Counter[str](), np.zeros(len(things))
@@ -156,13 +132,11 @@ class Rooms:
             fewest = [counts[thing.cls] / share[thing.cls] for thing in things] + 0.1 * looks
             aim = int(np.argmin(fewest))
             looks[aim] += 1
-            pose = self.camera.pose(rng, things[aim], room, self.sensor.intrinsics)
+            pose = self.camera.before(rng, things[aim], room, self.sensor.intrinsics)
             if pose is None:
                 continue
             camera, box = Camera(self.sensor.intrinsics, pose), things[aim].mesh.bounds
-            explain = keep.view is not None
-            light = None if self.light is None else self.light.over(box)
-            shot = Shot(camera, bodies, box, renderer, rng, explain, light)
+            shot = Shot(camera, bodies, box, renderer, rng, keep.view is not None)
             frame = self.sensor.take(shot)
             if frame is None:
                 continue
@@ -256,19 +230,3 @@ class _Shelf:
     def draw(self, rng: np.random.Generator) -> MeshItem:
         own = self._of[self._classes[int(rng.choice(len(self._classes), p=self._shares))]]
         return own[int(rng.integers(len(own)))]
-
-
-def depth_image(
-    frame: DepthFrame, world_from_camera: np.ndarray, window: tuple[slice, slice]
-) -> DepthImage:
-    """Rows and columns of a frame as `qs3.datasets.frames` sees a picture, with its rotation."""
-    lens, step = frame.camera.intrinsics, frame.step_px
-    focal, (rows, columns) = lens.focal_px / step, window
-    camera = Pinhole(
-        focal,
-        focal,
-        (lens.cx_px - frame.left) / step - columns.start,
-        (lens.cy_px - frame.top) / step - rows.start,
-    )
-    depth = np.nan_to_num(frame.depth_m[window], nan=0.0)
-    return DepthImage(depth, camera, world_from_camera[:3, :3])

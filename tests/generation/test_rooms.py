@@ -15,7 +15,7 @@ from qs3.generation.command import generate
 from qs3.generation.furnishing import Furnished, Thing
 from qs3.generation.kept import Keep
 from qs3.generation.plan import planned
-from qs3.generation.rooms import RoomCamera, _Shelf, parts
+from qs3.generation.rooms import StandingCamera, _Shelf, parts
 from qs3.geometry.cameras import Camera, Intrinsics, project
 from qs3.store.store import open_pointset
 from qs3.utils.seeding import object_rng
@@ -47,8 +47,8 @@ def test_somebody_stands_in_the_room_and_sees_the_thing(seed, size, up):
     thing = Thing(box_of(middle - half, middle + half), None, "")
     chest = box_of([0.5, 0.5, 0.0], [1.5, 1.5, 2.0])
     room = Furnished(np.array([6.0, 5.5]), [thing], [chest], [])
-    law = RoomCamera(min_pitch_deg=-80, max_pitch_deg=80, roll_deg=0)
-    pose = law.pose(np.random.default_rng(seed), thing, room, LENS)
+    law = StandingCamera(min_pitch_deg=-80, max_pitch_deg=80, roll_deg=0)
+    pose = law.before(np.random.default_rng(seed), thing, room, LENS)
     if pose is None:
         return
     eye, near = pose[:3, 3], min(1, max(size) / 0.35)
