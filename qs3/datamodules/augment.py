@@ -10,28 +10,33 @@ from annotated_types import Ge, Interval
 from jaxtyping import Float
 from torch import Tensor
 
+from qs3.store.store import HEIGHTS
 from qs3.utils.settings import settings
 
 
 @settings
 class Augment:
-    """Cut, turn about z, anisotropic scale, shift, lift and jitter, in this order.
+    """Cut, mirror, tilt, turn about z, scale, shift, lift and jitter, in this order.
 
     Attributes:
         crop: the smallest share of a cloud that stays when a plane cuts it (see `crop`), as the
             picture's border and nearer things cut real objects; 1 leaves it whole.
-        rotate_z: turn each cloud about z by U(0, 2π).
+        mirror: every other cloud is mirrored, left to right.
+        tilt_deg: standard deviation of small turns about x and y, as where up is estimated.
+        turn_deg: turn each cloud about z by U(-turn_deg, turn_deg); 180 is any turn.
         scale: factor of each axis, U(1 / scale, scale); 1 leaves the size alone.
         shift: added to each axis, U(-shift, shift).
-        lift: of clouds over the floor (`data.scale=above_floor`), and of no others, added to z
-            alone, U(-lift, lift): how high a camera hangs is not known to the decimetre.
+        lift: of clouds over the floor (`HEIGHTS`), and of no others, added to z alone,
+            U(-lift, lift): how high a camera hangs is not known to the decimetre.
         jitter_sigma: standard deviation of the noise on each coordinate.
         jitter_clip: bound of that noise. PointNet, which the paper cites, has 0.05; the code that
             the paper's descends from 0.02.
     """
 
     crop: Annotated[float, Interval(gt=0, le=1)] = 1.0
-    rotate_z: bool = True
+    mirror: bool = False
+    tilt_deg: Annotated[float, Ge(0)] = 0.0
+    turn_deg: Annotated[float, Interval(ge=0, le=180)] = 180.0
     scale: Annotated[float, Ge(1)] = 1.0
     shift: Annotated[float, Ge(0)] = 0.0
     lift: Annotated[float, Ge(0)] = 0.0
@@ -58,14 +63,22 @@ class Augment:
 
         if self.crop < 1.0:
             points = crop(points, self.crop, generator, scale)
-        if self.rotate_z:
-            points = rotate_z(points, 2 * math.pi * uniform(b))
+        if self.mirror:
+            left = torch.where(uniform(b, 1) < 0.5, -points[..., 0], points[..., 0])
+            points = torch.cat([left[..., None], points[..., 1:]], dim=2)
+        if self.tilt_deg > 0.0:
+            angles = math.radians(self.tilt_deg) * torch.randn(b, 2, generator=generator, **like)
+            points = tilt(points, angles)
+        if self.turn_deg > 0.0:
+            half = math.radians(self.turn_deg)
+            angle = 2 * half * uniform(b)
+            points = rotate_z(points, angle if self.turn_deg == 180 else angle - half)
         if self.scale > 1.0:
             low, high = 1 / self.scale, self.scale
             points = points * (low + (high - low) * uniform(b, 1, 3))
         if self.shift > 0.0:
             points = points + self.shift * (2 * uniform(b, 1, 3) - 1)
-        if self.lift > 0.0 and scale == "above_floor":
+        if self.lift > 0.0 and scale in HEIGHTS:
             up = torch.arange(3, device=points.device).eq(2).to(points.dtype) * self.lift
             points = points + up * (2 * uniform(b, 1, 1) - 1)
         if self.jitter_sigma > 0.0:
@@ -80,6 +93,16 @@ def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, " b"]) -> Floa
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]  # [B, 1]
     x, y, z = points.unbind(dim=2)  # [B, N] each
     return torch.stack([cos * x - sin * y, sin * x + cos * y, z], dim=2)
+
+
+def tilt(points: Float[Tensor, "b n 3"], angles: Float[Tensor, "b 2"]) -> Float[Tensor, "b n 3"]:
+    """Turn each cloud about x, then about y, by its angles in radians, about its mean height."""
+    cos, sin = angles.cos()[..., None], angles.sin()[..., None]  # [B, 2, 1]
+    middle = points[..., 2].mean(dim=1, keepdim=True)
+    x, y, z = points[..., 0], points[..., 1], points[..., 2] - middle
+    y, z = cos[:, 0] * y - sin[:, 0] * z, sin[:, 0] * y + cos[:, 0] * z
+    x, z = cos[:, 1] * x + sin[:, 1] * z, cos[:, 1] * z - sin[:, 1] * x
+    return torch.stack([x, y, z + middle], dim=2)
 
 
 def crop(
@@ -100,7 +123,7 @@ def crop(
     left = torch.zeros_like(first).scatter(1, order, first)  # [B, N]
     other = torch.multinomial(left.float(), n, replacement=True, generator=generator)  # [B, N]
     centre = (points * left[..., None]).sum(dim=1) / left.sum(dim=1, keepdim=True)  # [B, 3]
-    if scale == "above_floor":
+    if scale in HEIGHTS:
         centre[:, 2] = 0
     moved = points - centre[:, None]
     moved = torch.where(left[..., None], moved, moved.take_along_dim(other[..., None], dim=1))

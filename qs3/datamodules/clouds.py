@@ -18,7 +18,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from qs3.datamodules.fps_samples import farthest_points
-from qs3.store.store import PointSet
+from qs3.store.store import HEIGHTS, PointSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,10 @@ class Clouds:
         radius: [N] float32, largest distance from the centroid; 1 where it is 0.
         rows: [n] which of the N clouds these are.
         scale: "unit_ball": a batch's clouds are divided by their radius; "metres": they are not;
-            "above_floor": they are not, and z is the height above the floor, not the centroid.
-        floor: z of the floor in `stored`; for "above_floor".
+            "above_floor": they are not, and z is the height above the floor, not the centroid;
+            "seen": so, and turned about z so that the camera, which is at x = y = 0 of `stored`,
+            looks along +y at the centroid.
+        floor: z of the floor in `stored`; for "above_floor" and "seen".
         names: ids of all N; empty where there are none.
     """
 
@@ -102,8 +104,11 @@ class Clouds:
         points -= centre[:, None]
         if self.scale == "unit_ball":
             points /= self.radius[rows, None, None]
-        elif self.scale == "above_floor":
+        elif self.scale in HEIGHTS:
             points[..., 2] += (first + centre)[:, None, 2] - np.float32(self.floor)
+        if self.scale == "seen":
+            x, y = (first + centre)[:, :2].T / np.hypot(*(first + centre)[:, :2].T).clip(1e-6)
+            points[..., :2] @= np.stack([y, x, -x, y], axis=1).reshape(-1, 2, 2)
         return torch.from_numpy(np.asarray(points))
 
     @property
@@ -159,7 +164,7 @@ def load_clouds(
     `scale` has no default: without it a net would silently see clouds of another size.
     """
     part = dataset.split(split)
-    assert scale != "above_floor" or dataset.floor_m is not None
+    assert scale not in HEIGHTS or dataset.floor_m is not None
     key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
     order = farthest_points(part.points, points, starts, cache_dir, key)
     return Clouds.of(part.points, order, scale, dataset.floor_m or 0.0, part.ids)

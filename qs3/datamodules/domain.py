@@ -35,8 +35,7 @@ class DomainData(LightningDataModule):
     Args:
         domain: a `Domain`, or the name of one of conf/domain, such as "modelnet10".
         points: of a cloud as a net sees it.
-        scale: "unit_ball", "metres" for clouds that keep their size, or "above_floor" for those
-            that keep their height above the floor, too.
+        scale: "unit_ball", "metres", "above_floor" or "seen": see `Clouds.scale`.
         fps_starts: samples of each training cloud, at least 1, from other first points; an epoch
             draws one.
         batch_size: of training batches, at least 2 (batch norm).

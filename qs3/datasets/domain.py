@@ -18,7 +18,7 @@ from qs3.config.location import python_command, typed
 from qs3.datasets.importing import Importer, import_into
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.store.meta import MadeOf, is_begun, is_finished, read_meta
-from qs3.store.store import PointSet, open_pointset
+from qs3.store.store import HEIGHTS, PointSet, open_pointset
 from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class Domain:
             config (instantiated when it is needed).
         simulated: the target's reality is simulated; every output about it says so.
         gravity: the axis that points up in the store: "z"; or "none" for clouds in the frame of
-            their camera, which training should not turn about z (protocol.augment.rotate_z=false).
+            their camera, which training should not turn about z (protocol.augment.turn_deg=0).
         unit: of the store's coordinates, "metres"; or "none": sizes mean nothing or are not known.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
             where the camera is the origin; None: not known.
@@ -104,7 +104,7 @@ class Domain:
     def check_scale(self, scale: str) -> None:
         """Raise ConfigError if a net cannot see the clouds at this scale (`data.scale`)."""
         lacks = "unit=metres" if scale != "unit_ball" and self.unit != "metres" else ""
-        if scale == "above_floor" and self.floor_m is None:
+        if scale in HEIGHTS and self.floor_m is None:
             lacks = lacks or "floor_m"
         if lacks:
             raise ConfigError(

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from qs3.datamodules.clouds import Clouds
+from qs3.store.store import HEIGHTS
 
 MEASURES = {
     "points": "different points",
@@ -46,7 +47,7 @@ def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
     found = measure(stored, sample)
     if clouds.scale != "unit_ball":
         found["size"] = float(clouds.radius[row])
-    if clouds.scale == "above_floor":
+    if clouds.scale in HEIGHTS:
         found["base"] = float(stored[:, 2].min() - clouds.floor)
     return found
 

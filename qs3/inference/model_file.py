@@ -65,7 +65,7 @@ class Result:
         target: name of the domain it was adapted to.
         gravity: the axis that points up in the clouds, "z"; "none": camera frame.
         scale: of a cloud as the net sees it: "unit_ball", "metres" if it knows sizes, or
-            "above_floor" if it knows heights, too.
+            "above_floor" if it knows heights, too, or "seen" if it also knows where the camera is.
         usual: of each measure of `qs3.evaluation.ood` the range in training, [low, high].
         weights: of the net.
         floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
@@ -82,7 +82,7 @@ class Result:
     stored_points: Annotated[int, Ge(1)]
     target: str
     gravity: Annotated[str, Field(pattern="^(z|none)$")]
-    scale: Annotated[str, Field(pattern="^(unit_ball|metres|above_floor)$")]
+    scale: Annotated[str, Field(pattern="^(unit_ball|metres|above_floor|seen)$")]
     usual: dict[str, Annotated[list[float], Len(2, 2)]]
     weights: dict[str, Tensor]
     floor_m: float | None = None

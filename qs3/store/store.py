@@ -53,6 +53,9 @@ from qs3.utils.version import VERSION
 
 _CHUNK_CLOUDS = 512  # that are in memory at a time
 
+HEIGHTS = ("above_floor", "seen")
+"""Scales (`data.scale`) at which a net sees how high above the floor clouds are."""
+
 Clouds = np.ndarray | Sequence[np.ndarray]
 """[N, P, C], or N arrays [P, C], each of which is asked for when it is needed."""
 

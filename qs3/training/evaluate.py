@@ -45,6 +45,7 @@ from qs3.runs.predictions import (
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, WarmupSelection
 from qs3.selftraining.student_selection import STUDENT_SELECTED, StudentSelection
 from qs3.store.meta import read_manifest
+from qs3.store.store import HEIGHTS
 from qs3.training.fit import Built
 from qs3.training.load import Loaded, Shares, prior_beside, shares_of_student
 from qs3.training.run import STUDENT, Run
@@ -273,7 +274,7 @@ def _write(
     known = None
     if cfg.evaluation.norms == TRAINED:
         known = held_out(nets.of("validation", file), data.validation.labels.numpy())
-    floor = run.target.floor_m if cfg.data.scale == "above_floor" else None
+    floor = run.target.floor_m if cfg.data.scale in HEIGHTS else None
     result = Result(
         model=model,
         classes=evaluation.classes,

@@ -21,6 +21,7 @@ from qs3.inference.model_file import Result, read_result
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf, RoundRecord
 from qs3.store.meta import ManifestRow, read_manifest
+from qs3.store.store import HEIGHTS
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
 
@@ -203,7 +204,7 @@ def check_real_sizes(target: str, source: Clouds, *parts: Clouds) -> None:
                 f"{target}: the median radius of its clouds is {np.median(of_part):.3g}, of the "
                 f"labelled ones {np.median(of_source):.3g}: one of the two is not in metres"
             )
-        if source.scale == "above_floor":
+        if source.scale in HEIGHTS:
             lowest = _lowest(part)
             if np.mean(lowest < _lowest(source).min() - _BELOW_M) > 0.5:
                 log.warning("%s: half of the clouds reach below floor_m=%g", target, part.floor)

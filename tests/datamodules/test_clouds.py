@@ -60,6 +60,16 @@ def test_above_the_floor_clouds_keep_their_height_and_no_other_place():
     assert np.array_equal(some[0].numpy(), about[[3, 0]])
 
 
+def test_clouds_are_turned_as_their_camera_at_the_origin_sees_them():
+    points = np.float32([[3, 3, 1], [3, 5, 1], [5, 3, 1], [5, 5, 4]])  # (4, 4) is its middle
+    stored = np.stack([points, points * np.float32([1, -1, 1])])
+    seen = Clouds.of(stored, scale="seen", floor=0.5).points.numpy()
+    r = 2**0.5  # the nearest, the left one, the right one, the farthest
+    expected = [[0, -r, 0.5], [-r, 0, 0.5], [r, 0, 0.5], [0, r, 3.5]]
+    np.testing.assert_allclose(seen[0], expected, atol=1e-6)
+    np.testing.assert_allclose(seen[1], np.multiply(expected, [-1, 1, 1]), atol=1e-6)
+
+
 def test_a_batch_is_a_copy(mapped):
     mapped.take(torch.tensor([1])).zero_()
     assert np.array_equal(mapped.stored, STORED)
