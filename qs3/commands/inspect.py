@@ -63,7 +63,7 @@ def compare(
 
     Example:
         qs3 compare specklenet10 specklenet10 a.variant=points_clean
-        qs3 compare roomscan10 objects b.published.file=FILE b.published.fold=0
+        qs3 compare rooms10 objects b.published.file=FILE b.published.fold=0
     """
     from qs3.report.datasets import open_named
     from qs3.report.inspection import compare as measure

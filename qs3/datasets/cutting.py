@@ -125,7 +125,6 @@ class Piece:
             nearer covers.
         extent_m: along x, y and z.
         depth_m: median distance along the optical axis.
-        own: the pixels of `points_m`; None where nothing was cut.
         faults: what is wrong with it, once it was judged.
     """
 
@@ -138,7 +137,6 @@ class Piece:
     occ: float = 0.0
     extent_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth_m: float = 0.0
-    own: Bool[np.ndarray, "h w"] | None = None
     faults: tuple[Fault, ...] = ()
 
     @property
@@ -192,13 +190,11 @@ def cut(
     measured, core = measured_pixels(image, mask, rules, edge_px)
     own = body(pieces(measured, image.depth_m, rules), image.points_m, rules)
     points = image.points_m[own]
-    inlier, pixels, taken = inliers(points, rules), len(points), own
+    inlier, pixels = inliers(points, rules), len(points)
     if rules.drop_outliers:
-        taken = own.copy()
-        taken[own] = inlier
         points, inlier = points[inlier], inlier[inlier]
     holes = 1 - float(measured.sum()) / max(int(core.sum()), 1)
-    piece = Piece(points.astype(np.float32), inlier, pixels, holes, own=taken)
+    piece = Piece(points.astype(np.float32), inlier, pixels, holes)
     if pixels:
         x, y, z = np.ptp(points[inlier], axis=0).tolist()
         piece = replace(

@@ -15,13 +15,21 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Float
 
-from qs3.generation.arrangements import CELL_M, flat_within, heights_of, plain_chair
 from qs3.generation.scenes import HAIR_M, prism, rectangle, ring_of, table
-from qs3.meshes.mesh import Mesh, MeshItem
+from qs3.geometry.sampling import surface_sample
+from qs3.meshes.mesh import Mesh, MeshItem, merge
 from qs3.meshes.placement import RealSize
 from qs3.utils.settings import Positive, Share, settings
 
 _FLOOR_CELL_M = 0.05  # of the map of the floor
+_TOP_CELL_M = 0.04  # of the map of furniture from above
+_SAMPLES = 20_000
+_FLAT_M = 0.03
+"""Under a thing the surface differs by no more than this: a board or a mattress, no pillows."""
+_CHAIR_M = (0.38, 0.55)
+_SEAT_M = (0.42, 0.5)
+_BACK_M = (0.75, 1.05)
+"""Chairs that only hide things: width and depth, height of the seat and of the back."""
 _WALL_M = 2.6
 _TRIES = 12
 Range = tuple[Positive, Positive]
@@ -168,7 +176,7 @@ class Furnishing:
                 room.tables.append(pose.outline(mesh))
         for outline in room.tables:
             for _ in range(int(rng.integers(0, self.seats + 1))):
-                chair = _Pose(-np.pi / 2, np.zeros(2)).of(plain_chair(rng)[0])  # its back at +y
+                chair = _Pose(-np.pi / 2, np.zeros(2)).of(_plain_chair(rng))  # its back at +y
                 if (pose := room.drawn_up(chair, [outline])) is not None:
                     room.others.append(pose.of(chair))
         for top in room.carriers:
@@ -324,26 +332,32 @@ class _Top:
 
     @staticmethod
     def of(mesh: Mesh, rng: np.random.Generator, most: int) -> "_Top":
-        return _Top(*heights_of(mesh, rng), most)
+        """By points on the surface: thin rods may have gaps."""
+        points = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
+        low = mesh.bounds[0, :2]
+        cells = ((points[:, :2] - low) / _TOP_CELL_M).astype(int)
+        heights = np.full(cells.max(axis=0) + 1, -np.inf)
+        np.maximum.at(heights, (cells[:, 0], cells[:, 1]), points[:, 2])
+        return _Top(low, heights, most)
 
     def spot(
         self, radius_m: float, rng: np.random.Generator, between_m: Range = (0.0, np.inf)
     ) -> np.ndarray | None:
         """[3] a place where all within `radius_m` is flat and at a height between; takes it."""
         high = (self.heights >= between_m[0]) & (self.heights <= between_m[1])
-        free = np.argwhere(flat_within(self.heights, radius_m) & high)
+        free = np.argwhere(_flat_within(self.heights, radius_m) & high)
         if not len(free):
             return None
         cell = free[int(rng.integers(len(free)))]
-        at = self.low + (cell + 0.5) * CELL_M
+        at = self.low + (cell + 0.5) * _TOP_CELL_M
         height = self.heights[tuple(cell)]
         self.fill(at, radius_m)
         return np.array([*at, height])
 
     def fill(self, at: np.ndarray, radius_m: float) -> None:
         """Something stands there now."""
-        reach = int(np.ceil(radius_m / CELL_M))
-        middle = ((at - self.low) / CELL_M).astype(int)
+        reach = int(np.ceil(radius_m / _TOP_CELL_M))
+        middle = ((at - self.low) / _TOP_CELL_M).astype(int)
         self.heights[tuple(slice(max(k - reach, 0), k + reach + 1) for k in middle)] = -np.inf
 
     def things(self, rng: np.random.Generator, size_m: Range) -> list[Mesh]:
@@ -363,6 +377,28 @@ class _Top:
 def _loaded(item: MeshItem, placing: RealSize) -> tuple[Mesh, str]:
     mesh = item.load()
     return placing.stand(mesh), mesh.sha256
+
+
+def _plain_chair(rng: np.random.Generator) -> Mesh:
+    """A seat on four legs with a back at -x, about the z axis."""
+    half = np.full(2, rng.uniform(*_CHAIR_M) / 2)
+    seat, back = rng.uniform(*_SEAT_M), rng.uniform(*_BACK_M)
+    low = table((-half, half), np.eye(2), 0.0, seat, 0.05, 0.035)
+    panel = rectangle(-half, np.array([-half[0] + 0.04, half[1]]))
+    gap = 0.0 if rng.random() < 0.6 else 0.15  # between the seat and the back
+    return merge([low, prism(panel, seat + gap + HAIR_M, back)])
+
+
+def _flat_within(heights: Float[np.ndarray, "x y"], radius_m: float) -> np.ndarray:
+    """[x, y] bool: where all cells within `radius_m` are there and of nearly one height."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    reach = max(round(radius_m / _TOP_CELL_M), 1)
+    # What lies outside the grid is as what shows nothing.
+    lowest = minimum_filter(heights, 2 * reach + 1, mode="constant", cval=-np.inf)
+    highest = maximum_filter(heights, 2 * reach + 1, mode="constant", cval=-np.inf)
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(lowest) & (highest - lowest < _FLAT_M)
 
 
 def _sides(mesh: Mesh) -> np.ndarray:

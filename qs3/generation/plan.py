@@ -28,10 +28,8 @@ from qs3.classes import CLASSES
 from qs3.config.hydra import build
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError
-from qs3.generation.camera_poses import Drift
 from qs3.generation.kept import Keep, save_view
 from qs3.generation.released import read_poses
-from qs3.generation.room_scans import RoomScan
 from qs3.generation.rooms import Rooms
 from qs3.meshes.folder import SPLITS, MeshFolder
 from qs3.meshes.io import Up
@@ -311,7 +309,6 @@ def _unused(cfg: DictConfig, recipe: Any) -> list[str]:
         return [key for key in _OF_LOOKING if cfg.get(key)]
     no_use = {
         "poses": "poses" not in cfg.recipe,
-        "tracking": isinstance(recipe, RoomScan) and build(cfg.tracking) != Drift(),
         "provenance": isinstance(recipe, Rooms),
         "materials": not recipe.sensor.sees_light,
         "light": not recipe.sensor.sees_light,

@@ -14,13 +14,12 @@ from jaxtyping import Bool
 from pydantic import InstanceOf
 
 from qs3.datasets.cutting import Rules, cut, inliers, measured_pixels, pieces
-from qs3.datasets.depth_images import DepthImage
+from qs3.datasets.depth_images import DepthImage, Pinhole
 from qs3.generation.camera_poses import direction
 from qs3.generation.furnishing import Furnished, Furnishing, Thing
 from qs3.generation.kept import Keep
 from qs3.generation.recipes import Cloud, Found, MaskCrop
-from qs3.generation.room_scans import RoomCamera, depth_image
-from qs3.geometry.cameras import Camera, Intrinsics
+from qs3.geometry.cameras import Camera, Intrinsics, look_at
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.meshes.mesh import MeshItem
 from qs3.meshes.placement import RealSize
@@ -39,14 +38,19 @@ _MOST_THINGS = 250  # labels of pixels have 8 bits
 
 
 @settings
-class StandingCamera(RoomCamera):
-    """Somebody stands in a furnished room.
+class StandingCamera:
+    """Somebody stands in a furnished room; the thing is anywhere in the picture."""
 
-    Attributes:
-        small_m: distances shrink with things whose largest side is below.
-    """
-
-    small_m: Positive = 0.35
+    min_height_m: float = 1.1  # above the floor
+    max_height_m: float = 1.7
+    min_distance_m: Positive = 1.3  # along the floor, from the thing's middle
+    max_distance_m: Positive = 4.5
+    clearance_m: NotNegative = 0.6  # at least, from the circle around the thing's footprint
+    spread: Share = 0.85  # of the picture's half width and height, within which its middle lies
+    min_pitch_deg: float = -5.0  # how far the camera looks down
+    max_pitch_deg: float = 40.0
+    roll_deg: NotNegative = 1.5  # standard deviation
+    small_m: Positive = 0.35  # distances shrink with things whose largest side is below
 
     def before(
         self, rng: np.random.Generator, thing: Thing, room: Furnished, lens: Intrinsics
@@ -65,8 +69,34 @@ class StandingCamera(RoomCamera):
             inside = (eye[:2] > _FROM_WALL_M) & (eye[:2] < room.size_m - _FROM_WALL_M)
             hit = ((eye > low - _APART_M) & (eye < high + _APART_M)).all(axis=1).any()
             if inside.all() and not hit:
-                return self.looking(rng, eye, middle, away, azimuth, lens)
+                return self._looking(rng, eye, middle, away, azimuth, lens)
         return None
+
+    def _looking(
+        self,
+        rng: np.random.Generator,
+        eye: np.ndarray,
+        middle: np.ndarray,
+        away: float,
+        azimuth: float,
+        lens: Intrinsics,
+    ) -> np.ndarray:
+        """[4, 4] world_from_camera at `eye` [3], `middle` [3] somewhere in the picture.
+
+        `eye` stands `away` from it along the floor, in the direction `azimuth`.
+        """
+        half = np.array([lens.width_px, lens.height_px]) / (2 * lens.focal_px)
+        right, down = np.arctan(rng.uniform(-self.spread, self.spread, 2) * half)
+        pitch = np.arctan2(eye[2] - middle[2], away) - down
+        low, high = np.deg2rad([self.min_pitch_deg, self.max_pitch_deg])
+        ahead = direction(azimuth + np.pi + right, -float(np.clip(pitch, low, high)))
+        pose = look_at(eye, eye + ahead)
+        roll = np.deg2rad(rng.normal(0, self.roll_deg))
+        turn = np.array(
+            [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
+        )
+        pose[:3, :3] = pose[:3, :3] @ turn
+        return pose
 
 
 @settings
@@ -180,7 +210,7 @@ class Rooms:
                 continue
             seen = np.isin(frame.label, np.array(group) + 1)
             window = _around(seen)
-            image, label = depth_image(frame, pose, window), frame.label[window]
+            image, label = _depth_image(frame, pose, window), frame.label[window]
             mask, edge_px = self.mask.drawn(seen[window], rng), None
             if rng.random() < self.worktops.get(cls, 0.0):
                 top = max(things[k].mesh.bounds[1, 2] for k in group) - pose[2, 3]
@@ -206,6 +236,22 @@ def parts(
     sizes = np.bincount(number[measured])
     for k in np.flatnonzero(sizes >= rules.limits_of(cls).pixels):
         yield number == k
+
+
+def _depth_image(
+    frame: DepthFrame, world_from_camera: np.ndarray, window: tuple[slice, slice]
+) -> DepthImage:
+    """Rows and columns of a frame as `qs3.datasets.frames` sees a picture, with its rotation."""
+    lens, step = frame.camera.intrinsics, frame.step_px
+    focal, (rows, columns) = lens.focal_px / step, window
+    camera = Pinhole(
+        focal,
+        focal,
+        (lens.cx_px - frame.left) / step - columns.start,
+        (lens.cy_px - frame.top) / step - rows.start,
+    )
+    depth = np.nan_to_num(frame.depth_m[window], nan=0.0)
+    return DepthImage(depth, camera, world_from_camera[:3, :3])
 
 
 def _around(seen: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:

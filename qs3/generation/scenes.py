@@ -1,15 +1,13 @@
 """What stands around the object: nothing (the paper), or a floor with clutter and occluders."""
 
-from dataclasses import field
 from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge
-from pydantic import InstanceOf
 
 from qs3.meshes.mesh import Mesh, merge
 from qs3.sensors.renderers.base import Body
-from qs3.utils.settings import Positive, Share, settings
+from qs3.utils.settings import Share, settings
 
 HAIR_M = 1e-4
 """What an object stands on is so far below it: its bottom face is in no other face's plane."""
@@ -19,17 +17,8 @@ HAIR_M = 1e-4
 class Surroundings(Protocol):
     """What stands around the object."""
 
-    def bodies(
-        self,
-        mesh: Mesh,
-        eyes_m: np.ndarray,
-        rng: np.random.Generator,
-        floor_m: float | None = None,
-    ) -> tuple[Body, ...]:
-        """The object first (label 1), then the rest (label 0).
-
-        `floor_m`: height of the floor; None: the object stands on it.
-        """
+    def bodies(self, mesh: Mesh, eyes_m: np.ndarray, rng: np.random.Generator) -> tuple[Body, ...]:
+        """The object first (label 1), then the rest (label 0)."""
         ...
 
 
@@ -37,73 +26,23 @@ class Surroundings(Protocol):
 class Alone:
     """The object floats in the dark, as in the paper."""
 
-    def bodies(
-        self,
-        mesh: Mesh,
-        eyes_m: np.ndarray,
-        rng: np.random.Generator,
-        floor_m: float | None = None,
-    ) -> tuple[Body, ...]:
+    def bodies(self, mesh: Mesh, eyes_m: np.ndarray, rng: np.random.Generator) -> tuple[Body, ...]:
         """The object, with the default albedo."""
         return (Body(mesh, albedo=0.8, label=1),)
 
 
 @settings
-class Support:
-    """What an object above the floor stands on: a block, or a board on four legs."""
-
-    min_margin_m: Positive = 0.03  # by which the top is wider, drawn for each of its four sides
-    max_margin_m: Positive = 0.4
-    block: Share = 0.4  # probability of a block down to the floor, as a chest is
-    min_board_m: Positive = 0.02  # thickness
-    max_board_m: Positive = 0.06
-    min_leg_m: Positive = 0.03
-    max_leg_m: Positive = 0.08
-
-    def under(self, mesh: Mesh, floor: float, rng: np.random.Generator) -> Mesh:
-        """It stands on z = `floor`, its top a hair below the object's lowest point."""
-        yaw = rng.uniform(0, 2 * np.pi)
-        turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-        own = mesh.vertices[:, :2] @ turn.T  # in the frame of the top, whose sides are its axes
-        margins = rng.uniform(self.min_margin_m, self.max_margin_m, (2, 2))
-        low, high = own.min(axis=0) - margins[0], own.max(axis=0) + margins[1]
-        block = rng.random() < self.block
-        board = rng.uniform(self.min_board_m, self.max_board_m)
-        leg = min(rng.uniform(self.min_leg_m, self.max_leg_m), float((high - low).min()) / 4)
-        top = float(mesh.bounds[0, 2]) - HAIR_M
-        if block or top - board <= floor:
-            return prism(rectangle(low, high) @ turn, floor, top)
-        return table((low, high), turn, floor, top, board, leg)
-
-
-@settings
 class Room:
-    """The object stands on a floor, maybe before a wall, among boxes and cylinders.
-
-    Pieces between the first camera and the object stand some way before it, as a table before a
-    chair.
-    """
+    """The object stands on a floor, maybe before a wall, among boxes and cylinders."""
 
     wall: Share = 0.5  # probability of one behind the object
     max_clutter: Annotated[int, Ge(0)] = 5  # pieces around the object
     max_occluders: Annotated[int, Ge(0)] = 2  # pieces close to it, which hide a part of it
-    clutter_m: Positive = 0.5  # largest side along the floor; up to 1.6 times as high
-    occluder_m: Positive = 0.3  # likewise
-    max_between: Annotated[int, Ge(0)] = 0  # pieces between it and the first camera
-    between_m: Positive = 1.0  # largest side along the floor
-    between_height_m: Positive = 0.8
     min_albedo: Share = 0.25  # of every body, drawn for each
     max_albedo: Share = 0.9
-    support: InstanceOf[Support] = field(default_factory=Support)
 
-    def bodies(
-        self,
-        mesh: Mesh,
-        eyes_m: np.ndarray,
-        rng: np.random.Generator,
-        floor_m: float | None = None,
-    ) -> tuple[Body, ...]:
-        """The object, the floor, what it stands on if that is not the floor, and the rest.
+    def bodies(self, mesh: Mesh, eyes_m: np.ndarray, rng: np.random.Generator) -> tuple[Body, ...]:
+        """The object, the floor, and the rest.
 
         Args:
             mesh: the object, placed.
@@ -111,18 +50,13 @@ class Room:
                 the object as seen from their mean: on a long walk around a small object it can
                 stand before one of them (in 0.25 % of the views of objects of 0.3 m).
             rng: of the scene.
-            floor_m: height of the floor, on which all else stands; None: the object does, too.
         """
         low, high = mesh.bounds
         centre, half = (low + high) / 2, (high - low) / 2
         radius = float(np.hypot(half[0], half[1]))
-        floor = float(low[2]) if floor_m is None else floor_m
+        floor = float(low[2])
 
         rest = [_quad(centre, floor, 6.0)]
-        if low[2] > floor + HAIR_M:
-            rest.append(self.support.under(mesh, floor, rng))
-            # All else keeps away from the furniture as it does from an object on the floor.
-            radius = float(np.hypot(*(rest[-1].vertices[:, :2] - centre[:2]).T).max())
         if rng.random() < self.wall:
             behind = centre[:2] - eyes_m[:, :2].mean(axis=0)
             angle = np.arctan2(behind[1], behind[0]) + rng.uniform(-0.6, 0.6)
@@ -130,41 +64,17 @@ class Room:
         pieces = []
         for _ in range(int(rng.integers(0, self.max_clutter + 1))):
             away = radius + rng.uniform(0.25, 1.2)
-            pieces.append(_piece(centre, away, floor, rng, largest_m=self.clutter_m))
+            pieces.append(_piece(centre, away, floor, rng, largest_m=0.5))
         for _ in range(int(rng.integers(0, self.max_occluders + 1))):
             # Touching or nearly touching the object's circle, lower than most objects.
             away = radius + rng.uniform(0.02, 0.2)
-            pieces.append(_piece(centre, away, floor, rng, largest_m=self.occluder_m))
-        if self.max_between:
-            for _ in range(int(rng.integers(0, self.max_between + 1))):
-                pieces.append(self._between(centre, radius, floor, eyes_m[0], rng))
-        rest += [piece for piece in pieces if not around_an_eye(piece, eyes_m)]
+            pieces.append(_piece(centre, away, floor, rng, largest_m=0.3))
+        rest += [piece for piece in pieces if not _around_an_eye(piece, eyes_m)]
         albedos = rng.uniform(self.min_albedo, self.max_albedo, len(rest) + 1)
         return tuple(
             Body(part, albedo=float(albedo), label=int(part is mesh))
             for part, albedo in zip([mesh, *rest], albedos, strict=True)
         )
-
-    def _between(
-        self,
-        centre: np.ndarray,
-        radius: float,
-        floor: float,
-        eye_m: np.ndarray,
-        rng: np.random.Generator,
-    ) -> Mesh:
-        """A box on the floor, beside or on the line from the object to a camera."""
-        ahead = eye_m[:2] - centre[:2]
-        distance = float(np.hypot(*ahead))
-        along = ahead / max(distance, 1e-9)
-        size = rng.uniform(
-            [0.15, 0.15, 0.2], [self.between_m, self.between_m, self.between_height_m]
-        )
-        nearest = radius + size[:2].max() / 2
-        away = nearest + rng.uniform(0.05, 0.5) * max(distance - nearest, 0.1)
-        aside = rng.normal(0, radius + 0.2) * np.array([-along[1], along[0]])
-        ring = ring_of(size[:2], 4, rng.uniform(0, 2 * np.pi))
-        return prism(ring + centre[:2] + away * along + aside, floor, floor + float(size[2]))
 
 
 def table(
@@ -209,7 +119,7 @@ def _quad(centre: np.ndarray, height: float, half_m: float) -> Mesh:
     return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def around_an_eye(piece: Mesh, eyes_m: np.ndarray) -> bool:
+def _around_an_eye(piece: Mesh, eyes_m: np.ndarray) -> bool:
     """Whether a camera would be in the piece or nearer to it than 30 cm."""
     low, high = piece.bounds
     return bool(((eyes_m > low - 0.3) & (eyes_m < high + 0.3)).all(axis=1).any())

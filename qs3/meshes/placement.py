@@ -1,14 +1,12 @@
 """How an object is put into the world before it is scanned."""
 
-from collections.abc import Mapping
-from dataclasses import field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from qs3.errors import MeshError
 from qs3.meshes.mesh import Mesh
-from qs3.utils.settings import Positive, Share, settings
+from qs3.utils.settings import Positive, settings
 
 
 @runtime_checkable
@@ -59,34 +57,6 @@ class RealSize:
         """A copy on the floor, its box's middle at x = y = 0."""
         scale = 1.0 if self.keeps(mesh) else self.fallback_side_m / largest_side(mesh)
         return _place(mesh, scale, True, yaw_rad)
-
-
-@settings
-class OnFurniture(RealSize):
-    """As `RealSize`, and things of some classes stand on furniture: above the floor, z = 0.
-
-    Attributes:
-        stands_m: by class the lowest and highest top that they stand on; things of a class that is
-            not here stand on the floor. The class is the first word of the id.
-        raised: by class the probability that a thing of it does not stand on the floor; 0 of one
-            that is not here.
-        tallest_m: taller ones always do, as floor lamps and trees.
-    """
-
-    stands_m: Mapping[str, tuple[Positive, Positive]] = field(default_factory=dict)
-    raised: Mapping[str, Share] = field(default_factory=dict)
-    tallest_m: Positive = 1.0
-
-    def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
-        """A turned copy on the floor or above it."""
-        placed = super().place(mesh, rng, object_id)
-        cls = object_id.split("/")[0]
-        raised, height = rng.random() < self.raised.get(cls, 0.0), rng.random()
-        ends = self.stands_m.get(cls)
-        if ends is None or not raised or placed.bounds[1, 2] > self.tallest_m:
-            return placed
-        low, high = ends
-        return placed.at(placed.vertices + np.array([0, 0, low + (high - low) * height]))
 
 
 def largest_side(mesh: Mesh) -> float:

@@ -4,13 +4,14 @@ from functools import partial
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.catalogue import Catalogue
-from qs3.generation.furnishing import Furnishing, Habits
+from qs3.generation.furnishing import Furnishing, Habits, _plain_chair, _Top
 from qs3.generation.scenes import prism, rectangle
-from qs3.meshes.mesh import MeshItem, merge
+from qs3.meshes.mesh import Mesh, MeshItem, merge
 
 SEEDS = st.integers(0, 10_000)
 
@@ -114,6 +115,41 @@ def test_what_hangs_is_at_a_wall_above_the_floor(seed):
         assert 1.2 <= thing.mesh.bounds[0, 2] <= 1.5
         back, _ = back_and_front(thing)
         assert np.minimum(back, room.size_m - back).min() < 0.3
+
+
+@settings(max_examples=40)
+@given(seed=SEEDS)
+def test_what_has_no_class_stands_on_flat_places(seed):
+    """A top of 1.2 x 0.8 m, 70 cm high, with a wall of 20 cm along one side."""
+    low, high, back = np.array([[-0.6, -0.4], [0.6, 0.4], [-0.6, 0.36]])
+    top = merge([prism(rectangle(low, high), 0, 0.7), prism(rectangle(back, high), 0.7, 0.9)])
+    rng = np.random.default_rng(seed)
+    things = _Top.of(top, rng, 6).things(rng, (0.06, 0.3))
+    assert len(things) <= 6
+    for thing in things:
+        low, high = thing.bounds
+        assert low[2] == pytest.approx(0.7, abs=2e-4)
+        assert 0.06 <= high[2] - low[2] <= 0.3
+        # Its whole foot is on the top, but for half a cell of the grid.
+        assert (low[:2] > [-0.6 - 0.05, -0.4 - 0.05]).all()
+        assert (high[:2] < [0.6 + 0.05, 0.36 + 0.05]).all()
+        assert trimesh.Trimesh(thing.vertices, thing.faces).is_volume
+
+
+def test_nothing_stands_on_a_slope():
+    roof, rng = trimesh.creation.cone(radius=1.0, height=1.0), np.random.default_rng(0)
+    slope = Mesh(np.asarray(roof.vertices), np.asarray(roof.faces))
+    assert not any(_Top.of(slope, rng, 3).things(rng, (0.06, 0.1)) for _ in range(10))
+
+
+@given(seed=SEEDS)
+def test_a_chair_without_a_class_has_a_seat_and_its_back_behind_it(seed):
+    chair = _plain_chair(np.random.default_rng(seed))
+    seat, back = chair.vertices[:8], chair.vertices[-8:]
+    assert chair.bounds[0, 2] == 0
+    assert 0.42 <= seat[:, 2].max() <= 0.5 < 0.75 <= back[:, 2].max() <= 1.05
+    assert back[:, 0].max() < 0 == pytest.approx(seat[:, :2].mean())
+    assert trimesh.Trimesh(chair.vertices, chair.faces).is_volume
 
 
 def test_habits_are_drawn_as_often_as_they_are_likely():

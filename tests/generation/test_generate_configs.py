@@ -16,7 +16,7 @@ from tests.generation.generating import composed as config
 DOMAINS = (
     *("specklenet10", "specklenet10_clean", "blensor10", "kinectsim10"),
     *("modelnet10", "modelnet10_dropout"),
-    *("specklenet10_view", "roomscan10", "rooms10", "kinectsim10_full"),
+    *("specklenet10_view", "rooms10", "kinectsim10_full"),
 )
 
 
@@ -75,7 +75,6 @@ def test_benchmarks_know_themselves_and_their_parts():
         assert benchmark(other).startswith("like kinectsim10 v2, but not it")
     assert benchmark("splits=[train]", other).startswith("like kinectsim10 v2, but not it")
     assert benchmark("splits=[train]") == "kinectsim10 v2, train"
-    assert benchmark(domain="roomscan10") == "roomscan10 v4"
     assert benchmark(domain="rooms10") == "rooms10 v1"
     assert benchmark("recipe.by_class=0", domain="rooms10").startswith("like rooms10 v1, but")
     assert benchmark(domain="kinectsim10_full") == "kinectsim10_full v1"
@@ -208,9 +207,7 @@ def test_scans_that_would_share_a_name_are_refused(tmp_path):
         (["domain=modelnet10", "keep_views=true"], "no use"),
         *((["domain=blensor10", word], "no use") for word in ("materials=mixed", "light=area")),
         (["domain=kinectsim10", "poses=a.tar.gz"], "no use for poses"),
-        (["domain=roomscan10", "tracking=drifting"], "no use for tracking"),
         (["domain=rooms10", "provenance=true"], "no use for provenance"),
-        (["domain=roomscan10", "scene=alone"], "scene"),
         (["domain=modelnet10_dropout", "recipe.dropout.max_share=0.9"], "dropout"),
         (["materials=mixed", "materials.kinds.wood.albedo=[0.4,1.2]"], "wood.albedo"),
     ],

@@ -68,7 +68,7 @@ SMALL = """
 title: Small
 metrics: [accuracy]
 columns:
-  R → N: domain@data.source=roomscan10 domain@data.target=nyuv2 data.scale=metres
+  R → N: domain@data.source=rooms10 domain@data.target=nyuv2 data.scale=metres
   S → K: domain@data.source=specklenet10 domain@data.target=kinectsim10
   PointDA-10: null
 rows:

@@ -21,7 +21,7 @@ OWN = """
 title: Own
 metrics: [accuracy]
 columns:
-  R → N: domain@data.source=roomscan10 domain@data.target=nyuv2
+  R → N: domain@data.source=rooms10 domain@data.target=nyuv2
   S → K: domain@data.source=specklenet10 domain@data.target=kinectsim10
   PointDA-10: null
 rows:
