@@ -67,7 +67,7 @@ class Augment:
             left = torch.where(uniform(b, 1) < 0.5, -points[..., 0], points[..., 0])
             points = torch.cat([left[..., None], points[..., 1:]], dim=2)
         if self.tilt_deg > 0.0:
-            angles = math.radians(self.tilt_deg) * torch.randn(b, 2, generator=generator, **like)
+            angles = math.radians(self.tilt_deg) * torch.randn(b, 2, generator=generator, **like)  # type: ignore[call-overload]
             points = tilt(points, angles)
         if self.turn_deg > 0.0:
             half = math.radians(self.turn_deg)

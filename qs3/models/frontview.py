@@ -33,7 +33,6 @@ def front_pictures(points: Float[Tensor, "b n 3"], size: int) -> Float[Tensor, "
     and in the cloud's unit; its height; whether a point falls there, and whether one falls there or
     next to it. Where several fall, the nearest counts.
     """
-    b, n = points.shape[:2]
     low, high = points.amin(1), points.amax(1)
     side = _MARGIN * (high - low)[:, [0, 2]].amax(1).clamp(min=_LEAST)  # [B]
     at = (points - (low + high)[:, None] / 2) / side[:, None, None] + 0.5
