@@ -13,6 +13,8 @@ from torch import Tensor
 from qs3.store.store import HEIGHTS
 from qs3.utils.settings import settings
 
+_SEEN_TURN = math.radians(20)  # the camera is not quite where it is thought to be
+
 
 @settings
 class Augment:
@@ -23,7 +25,7 @@ class Augment:
             picture's border and nearer things cut real objects; 1 leaves it whole.
         mirror: every other cloud is mirrored, left to right.
         tilt_deg: standard deviation of small turns about x and y, as where up is estimated.
-        turn_deg: turn each cloud about z by U(-turn_deg, turn_deg); 180 is any turn.
+        rotate_z: turn each cloud about z by U(0, 2π), at `data.scale=seen` by U(-20°, 20°).
         scale: factor of each axis, U(1 / scale, scale); 1 leaves the size alone.
         shift: added to each axis, U(-shift, shift).
         lift: of clouds over the floor (`HEIGHTS`), and of no others, added to z alone,
@@ -36,7 +38,7 @@ class Augment:
     crop: Annotated[float, Interval(gt=0, le=1)] = 1.0
     mirror: bool = False
     tilt_deg: Annotated[float, Ge(0)] = 0.0
-    turn_deg: Annotated[float, Interval(ge=0, le=180)] = 180.0
+    rotate_z: bool = True
     scale: Annotated[float, Ge(1)] = 1.0
     shift: Annotated[float, Ge(0)] = 0.0
     lift: Annotated[float, Ge(0)] = 0.0
@@ -69,10 +71,10 @@ class Augment:
         if self.tilt_deg > 0.0:
             angles = math.radians(self.tilt_deg) * torch.randn(b, 2, generator=generator, **like)  # type: ignore[call-overload]
             points = tilt(points, angles)
-        if self.turn_deg > 0.0:
-            half = math.radians(self.turn_deg)
-            angle = 2 * half * uniform(b)
-            points = rotate_z(points, angle if self.turn_deg == 180 else angle - half)
+        if self.rotate_z:
+            turn = uniform(b)
+            angle = _SEEN_TURN * (2 * turn - 1) if scale == "seen" else 2 * math.pi * turn
+            points = rotate_z(points, angle)
         if self.scale > 1.0:
             low, high = 1 / self.scale, self.scale
             points = points * (low + (high - low) * uniform(b, 1, 3))

@@ -39,7 +39,7 @@ class Domain:
             config (instantiated when it is needed).
         simulated: the target's reality is simulated; every output about it says so.
         gravity: the axis that points up in the store: "z"; or "none" for clouds in the frame of
-            their camera, which training should not turn about z (protocol.augment.turn_deg=0).
+            their camera, which training should not turn about z (protocol.augment.rotate_z=false).
         unit: of the store's coordinates, "metres"; or "none": sizes mean nothing or are not known.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
             where the camera is the origin; None: not known.

@@ -13,14 +13,14 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def test_jitter_is_clipped():
     points = torch.zeros(2, 1000, 3)
-    noise = Augment(turn_deg=0.0, jitter_sigma=0.01, jitter_clip=0.02)(points, generator())
+    noise = Augment(rotate_z=False, jitter_sigma=0.01, jitter_clip=0.02)(points, generator())
     assert noise.abs().max() == pytest.approx(0.02)
     assert float(noise.std()) == pytest.approx(0.0095, rel=0.05)
 
 
 def test_scale_and_shift_are_of_each_cloud_and_axis():
     points = torch.ones(4, 6, 3)
-    augment = Augment(turn_deg=0.0, scale=1.5, shift=0.2, jitter_sigma=0.0)
+    augment = Augment(rotate_z=False, scale=1.5, shift=0.2, jitter_sigma=0.0)
     moved = augment(points, generator())
     assert (moved.std(dim=1) < 1e-6).all()
     assert len(moved[:, 0].flatten().unique()) == 12
@@ -62,7 +62,7 @@ def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
 
 def test_a_lift_moves_each_cloud_up_or_down_as_a_whole():
     points = torch.rand(4000, 5, 3, generator=generator())
-    augment = Augment(turn_deg=0.0, jitter_sigma=0.0, lift=0.2)
+    augment = Augment(rotate_z=False, jitter_sigma=0.0, lift=0.2)
     moved = augment(points, generator(), "above_floor") - points
     assert torch.equal(moved[..., :2], torch.zeros(4000, 5, 2))
     by = moved[..., 2]
@@ -82,7 +82,7 @@ def test_a_cut_cloud_fills_the_unit_ball_again_unless_it_has_a_size():
     )
     metres = crop(points, 0.3, generator(), "metres")
     assert (metres.norm(dim=2).amax(1) < 0.95).all()
-    augment = Augment(crop=0.3, turn_deg=0.0, jitter_sigma=0.0)
+    augment = Augment(crop=0.3, rotate_z=False, jitter_sigma=0.0)
     assert torch.equal(augment(points, generator(), scale="metres"), metres)
     one = torch.ones(2, 5, 3)  # all points at one place: nothing to divide by
     assert torch.equal(crop(one, 0.3, generator(), "unit_ball"), torch.zeros(2, 5, 3))
@@ -91,7 +91,7 @@ def test_a_cut_cloud_fills_the_unit_ball_again_unless_it_has_a_size():
 def test_a_tilt_turns_each_cloud_about_its_middle_and_a_mirror_half_of_them():
     points = torch.rand(400, 30, 3, generator=generator(), dtype=torch.float64)
     points -= points.mean(1, keepdim=True)
-    still = {"turn_deg": 0.0, "jitter_sigma": 0.0}
+    still = {"rotate_z": False, "jitter_sigma": 0.0}
     tilted = Augment(tilt_deg=3.0, **still)(points, generator())
     assert torch.allclose(torch.cdist(tilted, tilted), torch.cdist(points, points), atol=1e-6)
     assert torch.allclose(tilted[..., 2].mean(1), points[..., 2].mean(1))
@@ -103,9 +103,9 @@ def test_a_tilt_turns_each_cloud_about_its_middle_and_a_mirror_half_of_them():
     assert torch.equal(mirrored[flipped], points[flipped] * torch.tensor([-1.0, 1, 1]))
 
 
-def test_a_small_turn_is_to_either_side():
+def test_what_a_camera_has_seen_is_turned_a_little_to_either_side():
     points = torch.tensor([[1.0, 0, 0]]).repeat(2000, 1, 1)
-    turned = Augment(turn_deg=20.0, jitter_sigma=0.0)(points, generator())
+    turned = Augment(jitter_sigma=0.0)(points, generator(), "seen")
     angle = torch.atan2(turned[..., 1], turned[..., 0]).rad2deg()
     assert float(angle.abs().max()) == pytest.approx(20, abs=0.1)
     assert float(angle.mean()) == pytest.approx(0, abs=1)

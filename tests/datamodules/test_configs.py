@@ -36,11 +36,11 @@ hydra: {{searchpath: ["file://{CONF}"]}}
 datamodule:
   points: 32
   data_dir: {tmp_path / "data"}
-  augment: {{_target_: qs3.datamodules.augment.Augment, turn_deg: 0.0}}
+  augment: {{_target_: qs3.datamodules.augment.Augment, rotate_z: false}}
 """
     )
     with initialize_config_dir(str(tmp_path), version_base="1.3"):
         data = instantiate(compose("mine").datamodule)
-    assert data.augment == Augment(turn_deg=0.0)
+    assert data.augment == Augment(rotate_z=False)
     data.setup("fit")
     assert next(iter(data.train_dataloader()))["points"].shape == (16, 32, 3)

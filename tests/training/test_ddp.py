@@ -28,7 +28,7 @@ WARMUP, EPOCHS = 6, 2
 # The same clouds whoever draws them, so that a process's clouds can be told by their coordinates.
 PLAIN = (
     *("data.points=64", "data.fps_starts=1", "paths.warmup_dir=null"),
-    *("protocol.augment.turn_deg=0", "protocol.augment.jitter_sigma=0.0"),
+    *("protocol.augment.rotate_z=false", "protocol.augment.jitter_sigma=0.0"),
 )
 SETTINGS = ("method=source_only", f"protocol.epochs={WARMUP}", "protocol.optimizer.lr=0.05", *PLAIN)
 FEATURED = "model._target_=tests.training.nets.featured"

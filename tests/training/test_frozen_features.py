@@ -21,7 +21,7 @@ from tests.training.conftest import result_of
 from tests.training.toy import overrides
 from tests.training.watching import interrupt
 
-UNTURNED = ("protocol.augment.turn_deg=0", "protocol.augment.jitter_sigma=0")
+UNTURNED = ("protocol.augment.rotate_z=false", "protocol.augment.jitter_sigma=0")
 
 
 @pytest.fixture
