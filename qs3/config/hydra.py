@@ -3,7 +3,7 @@
 The hash names a run's folder: the same command always finds its own run.
 
 Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
-`${qs3.tags:}`, `${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help texts
+`${qs3.tags:}`, `${qs3.scale:FLOOR}`, `${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help texts
 `${qs3.choices:GROUP}`, `${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
 """
 
@@ -139,6 +139,8 @@ _RESOLVERS: dict[str, Callable[..., Any]] = {
     "run_name": lambda *, _root_: run_name(_root_),
     "typed": typed,
     "wandb_id": lambda *, _root_: run_name(_root_).replace("/", "-"),
+    # What of a cloud in metres a net can see: a floor below the origin is a camera's.
+    "scale": lambda z: "metres" if z is None else "seen" if z < 0 else "above_floor",
 }
 for _name, _resolver in _RESOLVERS.items():
     OmegaConf.register_new_resolver(f"qs3.{_name}", _resolver, replace=True)

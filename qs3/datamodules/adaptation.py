@@ -31,9 +31,10 @@ class AdaptationData(LightningDataModule):
         augment: applied to every training batch, on its device.
         batch_size: of the warm-up, at least 2 (batch norm).
         seed: of the run.
-        owner: whose labels are trained on: "source", or "target_train" for the upper bound
-            (`method=supervised`), which alone asks for them.
+        owner: whose labels are trained on: "source", or "target_train" for the upper bound and
+            what lies below it (`method=supervised`, `few_labels`), which alone ask for them.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
+        beside_source: whether they hold the source's with their labels, too, as "beside".
         make_source: a generated source that is not there is made first.
         sampler, clouds_a_class: of the labelled domain, see `DomainData`. "balanced" is for
             the source alone: to balance the target's classes takes its true labels.
@@ -60,6 +61,7 @@ class AdaptationData(LightningDataModule):
         seed: int,
         owner: str = "source",
         uses_target: bool = False,
+        beside_source: bool = False,
         make_source: bool = False,
         sampler: str = "shuffled",
         clouds_a_class: int | None = None,
@@ -72,6 +74,7 @@ class AdaptationData(LightningDataModule):
         shown: dict[str, Any] = {"sampler": sampler, "clouds_a_class": clouds_a_class}
         self.labelled_domain = DomainData(labelled, **shown, **shared)
         self.target_domain = DomainData(target, labels=False, **shared)
+        self.beside_domain = DomainData(source, **shared) if beside_source else None
         self.owner, self.uses_target = owner, uses_target
         self.phases, self.scheme, self.augment = phases, scheme, augment
         self.scale = self.target_domain.scale
@@ -86,14 +89,16 @@ class AdaptationData(LightningDataModule):
             MissingDataError: one or both are not there; says how to get them.
         """
         check_or_make(self.source, self.target_domain.domain, self.make_source)
-        for part in (self.labelled_domain, self.target_domain):
-            part.prepare_data()
+        for part in (self.labelled_domain, self.target_domain, self.beside_domain):
+            if part is not None:
+                part.prepare_data()
 
     def setup(self, stage: str | None = None) -> None:
         """Load the training clouds of both; for evaluation see `qs3.evaluation.metrics`."""
         labelled, target = self.labelled_domain, self.target_domain
-        for part in (labelled, target):
-            part.setup("fit")
+        for part in (labelled, target, self.beside_domain):
+            if part is not None:
+                part.setup("fit")
         assert isinstance(labelled.train, Labelled)
         assert isinstance(target.train, Clouds)
         assert labelled.whole is not None
@@ -114,6 +119,9 @@ class AdaptationData(LightningDataModule):
             parts["source"] = replace(self.labelled, owner=f"y_{self.owner}")
         if warmup and self.uses_target:
             parts["target"] = self.target
+        if warmup and self.beside_domain is not None:
+            assert isinstance(self.beside_domain.train, Labelled)
+            parts["beside"] = replace(self.beside_domain.train, owner="y_source")
         steps = self.phases.steps(epoch)
         start, _ = self.phases.span(self.phases.phase(epoch))
         return Batches(

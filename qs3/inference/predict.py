@@ -83,7 +83,7 @@ def _predicted(
     good = [one for one in batch if one.cls]
     if second and good:
         ready = [second.prepare(one.cloud, one.name, one.axis, floor).points for one in good]
-        found = second.probabilities(torch.stack(ready), len(ready))
+        found = second.probabilities(torch.stack(ready), len(ready), floor)
         for one, each in zip(good, found, strict=True):
             one.second = "" if np.isnan(each).any() else second.classes[int(each.argmax())]
     return batch

@@ -2,7 +2,7 @@
 
 A cloud goes the way of the target's clouds in the run: it is brought to as many points as these
 were stored with (`resample`); put into the unit ball, or of a net that sees metres only centred, or
-of one that sees heights put over the floor; and of it the farthest `points` points are taken. The
+of one that sees heights put over the floor, or also turned as its camera saw it; and of it the farthest `points` points are taken. The
 test clouds of a run get the probabilities of its predictions.csv; with `evaluation.prior` if `load`
 gets the same.
 """
@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
 from qs3.datasets.clouds import check_shape, checked
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 
 BATCH = 32  # clouds: more are no faster on a CPU
 DIVERGED = "the classifier's answer is not a number: its training has diverged"
+_SIDES = 8
 HIGHEST_M = 30.0
 """Limit on heights in metres: a floor or a camera beyond it is in another unit."""
 
@@ -136,11 +138,25 @@ class Predictor:
         return (self.result.floor_m or 0.0) if given is None else given
 
     def probabilities(
-        self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
+        self,
+        points: Float[Tensor, "n m 3"],
+        batch_size: int = BATCH,
+        floor: float | None = None,
     ) -> Float[np.ndarray, "n c"]:
-        """Class probabilities of prepared clouds, with `prior`; n >= 1."""
-        found = predict(self.net, points, batch_size, self.device)
+        """Class probabilities of prepared clouds, with `prior`; n >= 1. `floor` as in `prepare`."""
+        found = self._plain(points, batch_size, self.floor(floor))
         return self.prior(found) if self.prior else found
+
+    def _plain(
+        self, points: Float[Tensor, "n m 3"], batch_size: int, floor: float
+    ) -> Float[np.ndarray, "n c"]:
+        """Without `prior`; where the origin cannot be the camera, averaged over all sides."""
+        sides = _SIDES if self.result.scale == "seen" and floor >= 0 else 1
+        found = []
+        for k in range(sides):
+            turned = rotate_z(points, torch.full((len(points),), 2 * torch.pi * k / sides))
+            found.append(predict(self.net, turned if k else points, batch_size, self.device))
+        return np.mean(found, axis=0)
 
     def __call__(
         self,
@@ -175,7 +191,7 @@ class Predictor:
         ready = [self.prepare(cloud, name, up, floor) for cloud, name in pairs]
         if words := other_units("; ".join(one.strange) for one in ready):
             log.warning("of %d clouds %s", len(ready), words)
-        return self.probabilities(torch.stack([one.points for one in ready]), batch_size)
+        return self.probabilities(torch.stack([one.points for one in ready]), batch_size, floor)
 
     def predict(self, samples: Sequence[Sample], floor: float | None = None) -> None:
         """Fill in what the net makes of samples, in one batch; `floor` as in `prepare`.
@@ -196,7 +212,7 @@ class Predictor:
         if not ready:
             return
         stacked = torch.stack([points for _, points in ready])
-        plain = predict(self.net, stacked, len(ready), self.device)
+        plain = self._plain(stacked, len(ready), self.floor(floor))
         found = self.prior(plain) if self.prior else plain
         for (one, _), raw, each in zip(ready, plain, found, strict=True):
             if np.isnan(raw).any():

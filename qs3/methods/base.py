@@ -36,6 +36,7 @@ class Method(nn.Module):
     Attributes:
         labels: whose labels it trains on: "source", or "target_train" (the upper bound only).
         uses_target: whether its batches hold unlabelled target clouds.
+        beside_source: whether those of a method of the target's labels hold the source's, too.
         smoothing: of class labels (`class_loss`); the trainer sets it to `protocol.smoothing`.
         metres: whether clouds keep their size (`data.scale`); the trainer says so. A loss with
             lengths in it divides by each cloud's size then.
@@ -43,6 +44,7 @@ class Method(nn.Module):
 
     labels: ClassVar[str] = "source"
     uses_target: ClassVar[bool] = False
+    beside_source: ClassVar[bool] = False
     smoothing: float = 0.0
     metres: bool = False
 

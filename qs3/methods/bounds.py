@@ -1,4 +1,7 @@
-"""The bounds of every table: source only, and supervised on the target's training labels."""
+"""The bounds of every table: source only, and supervised on the target's training labels.
+
+Between them lies what a few labels of the target bring.
+"""
 
 from typing import ClassVar
 
@@ -26,3 +29,18 @@ class Supervised(SourceOnly):
     """
 
     labels: ClassVar[str] = "target_train"
+
+
+class FewLabels(Supervised):
+    """L = CE(net(x_t), y_t) + CE(net(x_s), y_s): labelled target clouds, few of a class, and source.
+
+    `data.clouds_a_class` says how few.
+    """
+
+    beside_source: ClassVar[bool] = True
+
+    def loss(self, net: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
+        """Cross-entropies "ce" of the target's and "source" of the source's clouds, each >= 0."""
+        terms, source = super().loss(net, batch, generator), batch["beside"]
+        terms["source"] = class_loss(net(source["points"]), source["y_source"], self.smoothing)
+        return terms

@@ -97,6 +97,7 @@ def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
         seed=run.seed,
         owner=method.labels,
         uses_target=method.uses_target,
+        beside_source=method.beside_source,
     )
     data.prepare_data()
     source, target = run.source.open(verify=False), run.target.open(verify=False)

@@ -62,6 +62,19 @@ def test_the_adaptation_has_the_source_s_labels_and_no_test_clouds(data_dir):
     assert isinstance(bound.target_domain.train, Clouds)
 
 
+def test_few_labelled_target_clouds_and_the_source_beside_them(data_dir):
+    data = adaptation(data_dir, owner="target_train", beside_source=True, clouds_a_class=2)
+    source = made(data_dir)
+    assert len(data.labelled) == 2 * len(data.target_domain.classes)
+    assert set(data.labelled.ids) <= set(data.target.ids)
+    batches = list(data.train_dataloader())
+    assert sum(len(batch["source"]["y_target_train"]) for batch in batches) == len(data.labelled)
+    assert data.beside_domain.train.ids == source.train.ids
+    for batch in batches:
+        assert set(batch["beside"]) == {"points", "y_source"}
+        assert len(batch["beside"]["points"]) == len(batch["source"]["points"])
+
+
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")  # Lightning's on trainers without a loader
 @pytest.mark.parametrize("limit", [1, 0.5])
 def test_a_part_of_the_validation_clouds_is_of_all_classes(data_dir, limit):

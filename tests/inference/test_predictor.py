@@ -13,8 +13,10 @@ import pytest
 import torch
 
 import qs3
+from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.domain import DomainData
 from qs3.errors import ConfigError, DataError
+from qs3.evaluation.metrics import predict
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.inference.predictor import resample
 from qs3.models.dgcnn import dgcnn
@@ -105,6 +107,23 @@ def test_a_net_of_heights_needs_the_floor(metric_run, test_clouds):
     np.testing.assert_array_equal(
         standing(test_clouds[:3], floor=0.5), high(test_clouds[:3], floor=0.5)
     )
+
+
+def test_where_the_camera_may_be_anywhere_all_sides_are_averaged(metric_run, test_clouds):
+    high = over_the_floor(qs3.load(metric_run))
+    seen = replace(high, result=replace(high.result, scale="seen"))
+    clouds = test_clouds[:3] + np.float32([2, 3, 0])
+
+    def turned(angle: float) -> np.ndarray:
+        turn = [[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        return (clouds @ np.array(turn)).astype(np.float32)
+
+    camera = seen(clouds, floor=-1.25)
+    np.testing.assert_allclose(seen(turned(1.0), floor=-1.25), camera, atol=1e-3)
+    ready = torch.stack([seen.prepare(one, floor=0.0).points for one in clouds])
+    sides = [rotate_z(ready, torch.full((3,), k * torch.pi / 4)) for k in range(8)]
+    expected = np.mean([predict(seen.net, side, 32) for side in sides], axis=0)
+    np.testing.assert_allclose(seen(clouds, floor=0.0), expected, atol=1e-5)
 
 
 def test_any_number_of_points_any_size_any_place(predictor, test_clouds):
