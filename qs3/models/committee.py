@@ -24,6 +24,7 @@ class SideBySide(Backbone):
     def __init__(self, backbones: Sequence[Backbone]) -> None:
         super().__init__()
         self.each = nn.ModuleList(backbones)
+        self.least_points = max(one.least_points for one in backbones)
         self.feature_dim = sum(one.feature_dim for one in backbones)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:

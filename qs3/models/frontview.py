@@ -29,7 +29,7 @@ _HEIGHT = 0.7  # about the middle of what stands in a room
 def front_pictures(points: Float[Tensor, "b n 3"], size: int) -> Float[Tensor, "b 5 size size"]:
     """What a camera that looks along +y sees; pixels where no point falls are 0.
 
-    Channels: how far a pixel is behind the cloud's median, as a share of half the picture's side,
+    Channels: how far a pixel is behind the cloud's middle, as a share of half the picture's side,
     and in the cloud's unit; its height; whether a point falls there, and whether one falls there or
     next to it. Where several fall, the nearest counts.
     """
@@ -41,7 +41,7 @@ def front_pictures(points: Float[Tensor, "b n 3"], size: int) -> Float[Tensor, "
     depth = points[..., 1]
     empty = torch.full_like(depth[:, :1], torch.inf).repeat(1, size**2)
     nearest = empty.scatter_reduce(1, pixel, depth, "amin").gather(1, pixel)
-    behind = depth - depth.median(dim=1, keepdim=True).values
+    behind = depth - depth.mean(dim=1, keepdim=True)
     there = torch.ones_like(depth)
     values = [2 * behind / side[:, None], behind, points[..., 2] - _HEIGHT, there]
     seen = torch.stack(values, dim=1) * (depth <= nearest)[:, None]  # [B, 4, N]

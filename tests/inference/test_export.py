@@ -19,7 +19,9 @@ from qs3.inference.export import any_points, compared, export, made_up, metadata
 from qs3.inference.model_file import Result
 from qs3.inference.predictor import Predictor
 from qs3.models.base import PointClassifier
+from qs3.models.committee import committee
 from qs3.models.dgcnn import dgcnn
+from qs3.models.frontview import frontview
 from qs3.models.pointdan import pointdan
 from qs3.models.pointnet import pointnet
 from qs3.models.pointnet2 import pointnet2
@@ -66,6 +68,8 @@ NETS = {
     "pointnet uda": (lambda: pointnet(3, variant="uda", norm="instance"), 64),
     "simpleview": (lambda: simpleview(3, image_size=32), 64),
     "simpleview nearest": (lambda: simpleview(3, image_size=32, pixel="nearest", up="z"), 64),
+    "frontview": (lambda: frontview(3, image_size=16), 64),
+    "committee": (lambda: committee(3), 64),
     "pointdan": (lambda: pointdan(3, nodes=8, neighbours=8), 64),
     "pointnet2 ssg": (lambda: pointnet2(3, variant="ssg"), 600),
     "pointnet2 msg": (lambda: pointnet2(3), 600),

@@ -5,6 +5,7 @@ from qs3.models.frontview import front_pictures, sizes
 
 def test_a_picture_by_hand() -> None:
     # As wide as high, 1 m; the camera looks along +y. Behind the lower left point lies another.
+    # Their mean is at 2.6 m.
     points = torch.tensor([[[-0.5, 2, 0], [-0.5, 3, 0], [0.5, 2, 0.0], [0.5, 4, 1], [-0.5, 2, 1]]])
     picture = front_pictures(points.double(), 8)[0]
     side = 1.05
@@ -13,7 +14,7 @@ def test_a_picture_by_hand() -> None:
     assert torch.equal(picture[3].float(), there)
     assert picture[4].sum() == 16  # with their neighbours
     behind = torch.zeros(8, 8)
-    behind[0, 7] = 2.0  # of the median, 2 m; the point at 3 m is hidden
+    behind[[0, 7, 7], [0, 0, 7]], behind[0, 7] = -0.6, 1.4  # the point at 3 m is hidden
     torch.testing.assert_close(picture[1].float(), behind)
     torch.testing.assert_close(picture[0].float(), 2 * behind / side)
     heights = torch.zeros(8, 8)
