@@ -3,8 +3,8 @@
 The hash names a run's folder: the same command always finds its own run.
 
 Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
-`${qs3.tags:}`, `${qs3.scale:FLOOR}`, `${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help texts
-`${qs3.choices:GROUP}`, `${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
+`${qs3.tags:}`, `${qs3.scale:FLOOR}`, `${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help
+texts `${qs3.choices:GROUP}`, `${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
 """
 
 import hashlib

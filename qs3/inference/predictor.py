@@ -2,9 +2,9 @@
 
 A cloud goes the way of the target's clouds in the run: it is brought to as many points as these
 were stored with (`resample`); put into the unit ball, or of a net that sees metres only centred, or
-of one that sees heights put over the floor, or also turned as its camera saw it; and of it the farthest `points` points are taken. The
-test clouds of a run get the probabilities of its predictions.csv; with `evaluation.prior` if `load`
-gets the same.
+of one that sees heights put over the floor, or also turned as its camera saw it; and of it the
+farthest `points` points are taken. The test clouds of a run get the probabilities of its
+predictions.csv; with `evaluation.prior` if `load` gets the same.
 """
 
 import logging

@@ -32,9 +32,9 @@ class Supervised(SourceOnly):
 
 
 class FewLabels(Supervised):
-    """L = CE(net(x_t), y_t) + CE(net(x_s), y_s): labelled target clouds, few of a class, and source.
+    """L = CE(net(x_t), y_t) + CE(net(x_s), y_s): a few labels of the target and the source.
 
-    `data.clouds_a_class` says how few.
+    `data.clouds_a_class` says how many of a class.
     """
 
     beside_source: ClassVar[bool] = True

@@ -49,13 +49,16 @@ class Vote(nn.Module):
 class Committee(PointClassifier):
     """In training each member learns from a part of the batch of its own, as if it were alone."""
 
+    backbone: SideBySide
+    head: Vote
+
     def __init__(self, members: Sequence[PointClassifier]) -> None:
         backbones = [one.backbone for one in members]
         heads, dims = [one.head for one in members], [one.feature_dim for one in backbones]
         super().__init__(SideBySide(backbones), Vote(heads, dims))
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
-        """Logits; in training each cloud's are of one member, unless there are fewer than two each."""
+        """Logits; in training each cloud's are of one member, where each has at least two."""
         if not self.training or len(points) < 2 * len(self.backbone.each):
             return super().forward(points)
         nets = zip(self.backbone.each, self.head.each, strict=True)
