@@ -3,8 +3,9 @@
 The hash names a run's folder: the same command always finds its own run.
 
 Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
-`${qs3.tags:}`, `${qs3.scale:FLOOR}`, `${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help
-texts `${qs3.choices:GROUP}`, `${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
+`${qs3.tags:}`, `${qs3.scale:FLOOR}`, `${qs3.classes:FOLDER}`, `${qs3.count:CLASSES}`,
+`${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help texts `${qs3.choices:GROUP}`,
+`${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
 """
 
 import hashlib
@@ -23,6 +24,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import ValidationError
 
+from qs3.classes import CLASSES, class_list
 from qs3.config.location import CONF, PACKAGE, typed
 from qs3.errors import ConfigError, MissingDataError, Qs3Error
 from qs3.utils.files import sha256_file
@@ -130,6 +132,13 @@ def _files(group: str) -> list[Path]:
     return sorted(path for path in (CONF / group).glob("*.yaml") if path.stem != "none")
 
 
+def _classes_of(folder: str) -> list[str] | None:
+    """Those of a dataset, if it is there and they are not the ten."""
+    meta = Path(folder) / "meta.yaml"
+    found = tuple(OmegaConf.load(meta)["classes"]) if meta.is_file() else CLASSES
+    return None if found == CLASSES else list(found)
+
+
 _RESOLVERS: dict[str, Callable[..., Any]] = {
     "packaged": lambda: str(PACKAGE / "pretrained"),  # classifiers that come with qs3
     "choices": _choices,
@@ -140,6 +149,8 @@ _RESOLVERS: dict[str, Callable[..., Any]] = {
     "typed": typed,
     "wandb_id": lambda *, _root_: run_name(_root_).replace("/", "-"),
     # What of a cloud in metres a net can see: a floor below the origin is a camera's.
+    "count": lambda classes: len(class_list(classes)),
+    "classes": _classes_of,
     "scale": lambda z: "metres" if z is None else "seen" if z < 0 else "above_floor",
 }
 for _name, _resolver in _RESOLVERS.items():

@@ -31,7 +31,7 @@ from qs3.errors import ConfigError
 from qs3.generation.kept import Keep, save_view
 from qs3.generation.released import read_poses
 from qs3.generation.rooms import Rooms
-from qs3.meshes.folder import SPLITS, MeshFolder
+from qs3.meshes.folder import SPLITS, MeshFolder, classes_below
 from qs3.meshes.io import Up
 from qs3.meshes.mesh import MeshItem
 from qs3.meshes.scenes import buffer_files
@@ -292,6 +292,10 @@ def planned(cfg: DictConfig) -> Plan:
         raise ConfigError(problems(error)) from None
     plan = Plan(cfg, options, build(cfg.domain), build(cfg.recipe))
     if isinstance(plan.recipe, Rooms):
+        if options.meshes and plan.domain.classes is None and not options.fill_up:
+            names = classes_below(plan.mesh_root)
+            if names and tuple(names) != CLASSES:
+                plan = replace(plan, domain=replace(plan.domain, classes=list(names)))
         of = {split: tuple(i for i in plan.items if i.split == split) for split in SPLITS}
         shelves = {split: items for split, items in of.items() if items}
         plan = replace(plan, recipe=replace(plan.recipe, shelves=shelves))

@@ -152,6 +152,12 @@ class MeshFolder:
         return MeshItem(f"{cls}/{split}/{stem}", cls, split, load, origin, file)
 
 
+def classes_below(root: Path) -> list[str]:
+    """What the folders with meshes are called, those of the ten by our names; sorted."""
+    names = [folder.name for folder in _folders(root) if any(_meshes_below(folder))]
+    return sorted({known_as(name, CLASSES) or name for name in names})
+
+
 def _folders(root: Path) -> list[Path]:
     """Visible folders right below `root`, sorted; none if it is not there."""
     return sorted(path for path in root.glob("[!.]*") if path.is_dir())

@@ -111,3 +111,16 @@ def test_tags(tmp_path):
     assert OmegaConf.to_container(cfg.logger.wandb)["tags"] == expected
     cfg = toy_config(tmp_path, "logger=wandb", "selftraining=none", "domain@data.target=scannet10")
     assert cfg.logger.wandb.tags == ["specklenet10 -> scannet10", "pcm", "tinynet"]
+
+
+def test_what_follows_from_a_dataset_and_a_floor(tmp_path):
+    resolved = {
+        f"${{qs3.count:{classes}}}": count
+        for classes, count in (("null", 10), ("[box,cup]", 2), ("modelnet40", 40))
+    }
+    resolved |= {"${qs3.scale:null}": "metres", "${qs3.scale:0}": "above_floor"}
+    resolved |= {"${qs3.scale:-1.2}": "seen", f"${{qs3.classes:{tmp_path}}}": None}
+    for text, expected in resolved.items():
+        assert OmegaConf.create({"found": text}).found == expected
+    (tmp_path / "meta.yaml").write_text("classes: [box, cup]")
+    assert OmegaConf.create({"found": f"${{qs3.classes:{tmp_path}}}"}).found == ["box", "cup"]

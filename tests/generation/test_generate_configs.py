@@ -75,8 +75,8 @@ def test_benchmarks_know_themselves_and_their_parts():
         assert benchmark(other).startswith("like kinectsim10 v2, but not it")
     assert benchmark("splits=[train]", other).startswith("like kinectsim10 v2, but not it")
     assert benchmark("splits=[train]") == "kinectsim10 v2, train"
-    assert benchmark(domain="rooms10") == "rooms10 v1"
-    assert benchmark("recipe.by_class=0", domain="rooms10").startswith("like rooms10 v1, but")
+    assert benchmark(domain="rooms10") == "rooms10 v2"
+    assert benchmark("recipe.by_class=0", domain="rooms10").startswith("like rooms10 v2, but")
     assert benchmark(domain="kinectsim10_full") == "kinectsim10_full v1"
 
 
@@ -118,6 +118,16 @@ def test_the_catalogue_fills_up_what_own_meshes_lack(tmp_path):
         "chair": 6,
         "table": 10,
     }
+
+
+def test_rooms_have_the_classes_of_the_meshes_that_are_given(tmp_path):
+    own = own_meshes(tmp_path, Chair=3, mug=2)
+    plan = planned(config("domain=rooms10", own))
+    assert plan.domain.names == plan.classes == ("chair", "mug")
+    assert Counter((item.cls, item.split) for item in plan.items)["mug", "train"] == 2
+    assert planned(config("domain=rooms10", own, "classes=[mug]")).classes == ("mug",)
+    ten = own_meshes(tmp_path / "ten", **dict.fromkeys(CLASSES, 1))
+    assert planned(config("domain=rooms10", ten)).domain.classes is None
 
 
 def settings_of(*words):
@@ -173,7 +183,7 @@ def stored(cfg):
 
 
 def test_meta_holds_the_whole_config_but_places_and_what_changes_no_byte():
-    overrides = ("limit=3", "scene=room")
+    overrides = ("domain=specklenet10", "limit=3", "scene=room")
     meta = stored(config(*overrides, "meshes=/mine", "workers=3", "paths.data_dir=/x"))
     assert meta == stored(config(*overrides, "meshes=/yours", "renderer.threads=2"))
     assert meta == stored(config(*overrides, "meshes=/mine", "engine=slurm"))
@@ -202,7 +212,7 @@ def test_scans_that_would_share_a_name_are_refused(tmp_path):
     [
         (["classes=[chair,dragon]"], "dragon"),
         (["fraction=0"], "fraction"),
-        (["views=0"], "count"),
+        (["domain=specklenet10", "views=0"], "count"),
         (["domain=modelnet10", "+sensor=kinect_v1"], "no use"),
         (["domain=modelnet10", "keep_views=true"], "no use"),
         *((["domain=blensor10", word], "no use") for word in ("materials=mixed", "light=area")),
