@@ -85,4 +85,4 @@ def test_nets_round_layers_but_no_coordinates(name: str) -> None:
     assert set(layers) <= {"high"}
     assert set(turns) | set(distances) <= {"highest"}
     assert len(turns) == (name in ("dgcnn", "pointnet", "pointdan"))
-    assert len(distances) == {"dgcnn": 5, "pointdan": 1}.get(name, 0)
+    assert len(distances) == {"dgcnn": 5, "committee": 4, "pointdan": 1}.get(name, 0)

@@ -10,9 +10,8 @@ from qs3.kernels import plain
 from qs3.kernels.norms import adapt_batchnorm, use_domain
 from qs3.models import pointnet2, rscnn
 from qs3.models.base import PointClassifier
-from tests.models.test_all_nets import NETS, build, clouds, each_net
+from tests.models.test_all_nets import NETS, UNDROPPED, build, clouds, each_net
 
-UNDROPPED = {"pointdan", "committee"}  # no setting of theirs
 SMALL = {
     "dgcnn": {"k": 8},
     "pointdan": {"nodes": 8, "neighbours": 8},
