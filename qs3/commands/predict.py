@@ -40,8 +40,8 @@ def predict(
     """Classes and confidences of your clouds, or of objects in your depth images.
 
     Without ckpt= a classifier of ten classes that comes with qs3 is taken: dgcnn-rooms, which knows
-    sizes and heights and is right more often, if floor= or camera_height= is given, else
-    dgcnn-speckle, for clouds in any unit; second=pointnet-speckle then.
+    sizes and heights and is right more often, if floor= or camera_height= is given, with
+    second=dgcnn-speckle; else dgcnn-speckle, for clouds in any unit.
 
     CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders. A net that knows
     sizes takes them as metres; one that knows heights needs floor=, 0 if objects stand on z = 0.
@@ -80,7 +80,7 @@ def predict(
     how: dict[str, Any] = {"device": device, "packages": (*model_file.PACKAGES, *packages)}
     how |= {"prior": prior or None, "prior_power": prior_power}
     first = load(name, **how)
-    other = second or ("none" if ckpt else model_file.SECOND)
+    other = second or (model_file.ANY_SIZE if name == model_file.HEIGHTS else "none")
     opinion = None if other == "none" else steps.second_opinion(other, first, floor, **how)
     if depth is None:
         assert input is not None

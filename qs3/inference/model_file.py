@@ -46,9 +46,9 @@ PACKAGES = ("qs3.models",)
 """Packages that a file may take its net from."""
 
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
-ANY_SIZE, HEIGHTS, SECOND = "dgcnn-speckle", "dgcnn-rooms", "pointnet-speckle"
-"""What is used where no classifier is named: for clouds of any unit and place, for those in metres
-of which it is known where the floor is, and as a second opinion."""
+ANY_SIZE, HEIGHTS = "dgcnn-speckle", "dgcnn-rooms"
+"""What is used where no classifier is named: for clouds of any unit and place, and for those in metres
+of which it is known where the floor is; then the former is a second opinion."""
 
 _HASH = "weights_sha256"
 
