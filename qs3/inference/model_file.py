@@ -47,8 +47,8 @@ PACKAGES = ("qs3.models",)
 
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
 ANY_SIZE, HEIGHTS = "dgcnn-speckle", "dgcnn-rooms"
-"""What is used where no classifier is named: for clouds of any unit and place, and for those in metres
-of which it is known where the floor is; then the former is a second opinion."""
+"""Used where no classifier is named: for clouds of any unit and place, and for those in metres
+with a known floor; then the former is a second opinion."""
 
 _HASH = "weights_sha256"
 
