@@ -135,7 +135,7 @@ def _files(group: str) -> list[Path]:
 def _classes_of(folder: str) -> list[str] | None:
     """Those of a dataset, if it is there and they are not the ten."""
     meta = Path(folder) / "meta.yaml"
-    found = tuple(OmegaConf.load(meta)["classes"]) if meta.is_file() else CLASSES
+    found = tuple(OmegaConf.select(OmegaConf.load(meta), "classes")) if meta.is_file() else CLASSES
     return None if found == CLASSES else list(found)
 
 
