@@ -148,9 +148,9 @@ _RESOLVERS: dict[str, Callable[..., Any]] = {
     "run_name": lambda *, _root_: run_name(_root_),
     "typed": typed,
     "wandb_id": lambda *, _root_: run_name(_root_).replace("/", "-"),
-    # What of a cloud in metres a net can see: a floor below the origin is a camera's.
     "count": lambda classes: len(class_list(classes)),
     "classes": _classes_of,
+    # What of a cloud in metres a net can see: a floor below the origin is a camera's.
     "scale": lambda z: "metres" if z is None else "seen" if z < 0 else "above_floor",
 }
 for _name, _resolver in _RESOLVERS.items():
