@@ -5,7 +5,7 @@ Which object of which family a catalogue holds; the families are in one module p
 
 from functools import cache, partial
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge
@@ -23,14 +23,21 @@ class Catalogue:
     """Objects made on demand, each from (seed, class, split, index) alone.
 
     A larger catalogue therefore begins with the objects of a smaller one, and catalogues with
-    different seeds share no mesh. Test objects come from structural families that training objects
-    never come from.
+    different seeds share no mesh.
+
+    Attributes:
+        seed: of the meshes.
+        train, test: objects per class, or a count for every class.
+        classes: in any order: that of the items is of `qs3.classes`.
+        families: "apart" draws test objects from structural families that training objects never
+            come from; "shared" draws both from all families, as scenes of one building do.
     """
 
     seed: int = 0
-    train: Count | dict[str, Count] = 20  # objects per class, or a count for every class
+    train: Count | dict[str, Count] = 20
     test: Count | dict[str, Count] = 10
-    classes: tuple[str, ...] = CLASSES  # in any order: that of the items is of `qs3.classes`
+    classes: tuple[str, ...] = CLASSES
+    families: Literal["apart", "shared"] = "apart"
 
     def items(self) -> list[MeshItem]:
         """All objects, ordered by class, split (train first) and index; no mesh is made yet."""
@@ -43,7 +50,8 @@ class Catalogue:
         ]
 
     def _item(self, cls: str, split: str, index: int) -> MeshItem:
-        names = tuple(f.name for f in families(cls) if f.split == split)
+        shared = self.families == "shared"
+        names = tuple(f.name for f in families(cls) if shared or f.split == split)
         family = _shuffled(names, f"{self.seed}/{cls}/{split}")[index % len(names)]
         return MeshItem(
             id=f"{cls}/{split}/{cls}_{index:04d}",

@@ -28,6 +28,8 @@ class Phases:
         epochs: of each round.
         warmup_steps, round_steps: batches of the warm-up and of each round, spread evenly over its
             epochs; None: an epoch is one pass over what is trained on.
+        unbroken: the rounds' learning rate swings on, as in QS3's released code: it falls in the
+            first round, rises in the second, and so on.
     """
 
     warmup: int
@@ -35,6 +37,7 @@ class Phases:
     epochs: int = 0
     warmup_steps: int | None = None
     round_steps: int | None = None
+    unbroken: bool = False
 
     @property
     def total(self) -> int:
@@ -77,7 +80,8 @@ class Phases:
 
     def cosine(self, epoch: int) -> float:
         """Factor on the learning rate: from 1 towards 0 along a half cosine, in each phase anew."""
-        start, stop = self.span(self.phase(epoch))
+        phase = self.phase(epoch)
+        start, stop = self.span(min(phase, 1) if self.unbroken else phase)
         return 0.5 * (1.0 + math.cos(math.pi * (epoch - start) / (stop - start)))
 
 
@@ -95,9 +99,9 @@ class SelfTrainingConfig:
         theta: confidence that a pseudo-label must exceed, in round 0; 0 is for selectors that have
             thresholds of their own (CBST).
         epsilon: added to theta in each further round.
-        share: instead of theta and epsilon, the share of each round's predictions that exceeds its
-            threshold: where nets are unsure of everything, 0.8 selects next to nothing. None:
-            theta.
+        share: instead of theta and epsilon, the share of the first teacher's predictions that
+            exceeds the threshold of all rounds: where nets are unsure of everything, 0.8 selects
+            next to nothing. None: theta.
         init: weights a round begins with. "scratch" draws new ones; "continue" begins round 0 with
             the teacher that labelled it, and each further round with the student before;
             "persistent" draws new weights in round 0 alone, and keeps them and the optimiser's
@@ -106,6 +110,7 @@ class SelfTrainingConfig:
         pcm: whether the student's clouds are mixed (see `qs3.methods.pcm`).
         weight_step: by how much the weight of both losses falls each epoch of the rounds, from 1
             (GAST's code: 0.005; both fall alike, so only its relation to the weight decay matters).
+        released: the rounds of QS3's released code, see `qs3.selftraining.released`.
         mrkld: weight of CRST's regulariser (see `qs3.selftraining.student_selection`); 0 is none.
         rehearsal: train on all target samples, whatever the selector keeps (`debug=fast`).
 
@@ -126,19 +131,20 @@ class SelfTrainingConfig:
     pcm: bool = False
     weight_step: Annotated[float, Ge(0)] = 0.0
     mrkld: Annotated[float, Ge(0)] = 0.0
+    released: bool = False
     rehearsal: bool = False
 
     def __post_init__(self) -> None:
         if self.weight_step * (self.rounds * self.epochs - 1) >= 1:
             raise ConfigError(f"selftraining.weight_step={self.weight_step} falls to 0 in training")
 
-    def theta_of(self, round_: int, confidence: Float[np.ndarray, " n"] | None = None) -> float:
+    def theta_of(self, round_: int, confidence: Float[np.ndarray, " n"]) -> float:
         """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly.
 
-        With `share` it is a quantile of the round's `confidence`, and the highest ones exceed it
-        even where more than that share of them are equal.
+        With `share` it is a quantile of `confidence`, the first teacher's, in all rounds; the
+        highest ones exceed it even where more than that share of them are equal.
         """
-        if self.share is not None and confidence is not None:
+        if self.share is not None:
             quantile = np.quantile(confidence, 1 - self.share)
             return float(min(quantile, np.nextafter(confidence.max(), 0)))
         return float(Decimal(repr(self.theta)) + round_ * Decimal(repr(self.epsilon)))

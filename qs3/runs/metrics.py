@@ -161,7 +161,7 @@ class Quality:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class TrainingAccuracy:
-    """The share that is right of the n clouds that the net was trained on (`debug=overfit`)."""
+    """The share that is right of the n clouds trained on, with `data.clouds_a_class`."""
 
     n: int
     accuracy: float

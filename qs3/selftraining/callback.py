@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
@@ -136,7 +136,7 @@ class SelfTraining(Callback):
         data = trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(data, AdaptationData)
         teacher = self._predictions(trainer, pl_module, data, round_)
-        theta = self.scheme.theta_of(round_, teacher.confidence)
+        theta = self._theta(round_, teacher.confidence)
         selection = chosen_by(self.scheme.selector, teacher, theta, round_)
         if selection.labels is not None:  # a selector may name another class than the most probable
             teacher = teacher.relabelled(selection.labels)
@@ -168,14 +168,24 @@ class SelfTraining(Callback):
             if missing:
                 log.warning("round %d: no pseudo-label for %s", round_, ", ".join(missing))
 
+    def _theta(self, round_: int, confidence: Float[np.ndarray, " n"]) -> float:
+        """With `share` that of round 0: of a student's own labels ever more are sure."""
+        if self.scheme.share is not None and self.records:
+            return self.records[0].theta
+        return self.scheme.theta_of(round_, confidence)
+
+    def _teacher(self, pl_module: Classifier, round_: int) -> dict[str, Any] | None:
+        """The warm-up's selected weights (not its last); None is the student, in later rounds."""
+        return load(self.folder / WARMUP_SELECTED, pl_module.device) if round_ == 0 else None
+
     def _predictions(
         self, trainer: Trainer, pl_module: Classifier, data: AdaptationData, round_: int
     ) -> TeacherPredictions:
-        """Predictions by the warm-up's selected weights (not its last), later by the student."""
+        """Of all training clouds of the target."""
         teacher = pl_module.net
-        if round_ == 0:
+        if (weights := self._teacher(pl_module, round_)) is not None:
             teacher = pl_module.fresh_net(phase=0).to(pl_module.device)
-            teacher.load_state_dict(load(self.folder / WARMUP_SELECTED, pl_module.device))
+            teacher.load_state_dict(weights)
         clouds = (data.target.points, data.eval_batch_size, pl_module.device)
         # One process predicts for all: batch norm's statistics differ between processes.
         probabilities = trainer.strategy.broadcast(predict(teacher, *clouds))

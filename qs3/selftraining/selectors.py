@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
-from annotated_types import Ge
+from annotated_types import Ge, Interval
 from jaxtyping import Bool, Float, Int
 
 from qs3.errors import ConfigError, SelectionError
@@ -115,14 +115,17 @@ class Qbst:
         mu: "balanced" as above; "one" keeps every confident sample (a control).
         order: "descending" keeps the most confident, as the paper says; "ascending" the least
             confident, as the released code does.
-        counts: L_k in mu_k = 1 - L_k / n. "confident" counts L_k = n_k in A, as the released code
-            does; "all" counts all target samples predicted as k, as the paper's words read. That
-            can exceed n, so mu_k is clamped at 0 there.
+        counts: L_k in mu_k = 1 - L_k / n. "all" counts all target samples predicted as k, as the
+            paper's words read (mu_k is 0 where that exceeds n); "confident" counts L_k = n_k in A,
+            as the released code does.
+        floor: share of the samples predicted as each class, the most confident ones, that is kept
+            whatever theta and mu say, so that no class dies out (ours; the paper has none).
     """
 
     mu: Literal["balanced", "one"] = "balanced"
     order: Literal["descending", "ascending"] = "descending"
-    counts: Literal["confident", "all"] = "confident"
+    counts: Literal["confident", "all"] = "all"
+    floor: Annotated[float, Interval(ge=0, le=1)] = 0.0
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes and how sure of them it is."""
@@ -140,6 +143,9 @@ class Qbst:
         for k in range(classes):
             of_class = order[above[order] & (predicted[order] == k)]
             selected[of_class[: quota[k]]] = True
+        if self.floor:
+            everyone = (predicted, self.floor, teacher.ids, teacher.doubt)
+            selected |= most_confident(confidence, *everyone, least=1)
         return Selection(
             selected=selected,
             theta=theta,

@@ -28,6 +28,7 @@ from qs3.methods.base import Method, feature_dims
 from qs3.models.features import remember
 from qs3.runs.checkpoints import LAST, copy_weights, save
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
+from qs3.selftraining.released import ReleasedRounds
 from qs3.selftraining.student_selection import Student, StudentSelection
 from qs3.training.load import Loaded, load_data, read_given
 from qs3.training.provenance import changed
@@ -85,7 +86,8 @@ def _build(run: Run, method: Method, loaded: Loaded, given: Result | None, began
     cfg, folder, phases = run.cfg, run.folder, run.phases
     classifier = _classifier(run, method, given)
     warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
-    rounds = SelfTraining(folder, phases, run.scheme, loaded.evaluation.classes)
+    of_rounds = ReleasedRounds if run.scheme.released else SelfTraining
+    rounds = of_rounds(folder, phases, run.scheme, loaded.evaluation.classes)
     student = StudentSelection(folder, phases, cfg.selection.student)
     # Nobody else can use a warm-up of two versions.
     sharing = None if changed(loaded.started) else cfg.paths.warmup_dir

@@ -138,6 +138,7 @@ def run_of(cfg: DictConfig) -> Run:
             scheme.epochs,
             cfg.protocol.steps,
             scheme.steps,
+            unbroken=scheme.released,
         ),
         source=build(cfg.data.source),
         target=build(cfg.data.target),

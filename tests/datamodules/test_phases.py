@@ -56,6 +56,11 @@ def test_each_phase_has_its_own_cosine():
     assert [round(phases.cosine(e), 4) for e in range(6)] == [1, 0.8536, 0.5, 0.1464, 1, 0.5]
 
 
+def test_an_unbroken_cosine_rises_in_every_second_round():
+    phases = Phases(warmup=2, rounds=3, epochs=2, unbroken=True)
+    assert [round(phases.cosine(e), 4) for e in range(8)] == [1, 0.5, 1, 0.5, 0, 0.5, 1, 0.5]
+
+
 def test_without_rounds_all_is_warmup():
     phases = Phases(warmup=3)
     assert (phases.total, phases.phase(2), phases.ends(2)) == (3, 0, True)
@@ -63,10 +68,10 @@ def test_without_rounds_all_is_warmup():
 
 def test_theta_grows_without_rounding_error():
     scheme = SelfTrainingConfig(Qbst(), rounds=10, theta=0.8, epsilon=0.005)
-    assert [scheme.theta_of(j) for j in (0, 3, 9)] == [0.8, 0.815, 0.845]
+    assert [scheme.theta_of(j, np.ones(1)) for j in (0, 3, 9)] == [0.8, 0.815, 0.845]
 
 
-def test_a_share_is_of_those_above_the_round_s_threshold():
+def test_a_share_is_of_those_above_the_threshold():
     scheme = SelfTrainingConfig(Qbst(), rounds=2, share=0.25)
     confidence = np.random.default_rng(0).random(101)
     for round_ in (0, 1):  # whatever epsilon says
@@ -115,7 +120,7 @@ def test_what_is_not_set_is_the_paper_s():
     assert (scheme.init, scheme.share, scheme.steps) == ("scratch", None, None)
     assert (scheme.use_source, scheme.pcm, scheme.rehearsal) == (False, False, False)
     assert scheme.weight_step == scheme.mrkld == scheme.rounds == 0
-    assert dataclasses.astuple(Phases(3)) == (3, 0, 0, None, None)
+    assert dataclasses.astuple(Phases(3)) == (3, 0, 0, None, None, False)
 
 
 @pytest.mark.parametrize(
@@ -133,9 +138,9 @@ def test_settings_out_of_their_range_are_refused(wrong):
 
 def test_the_smallest_settings_are_allowed():
     scheme = SelfTrainingConfig(
-        rounds=1, epochs=1, steps=1, batch_size=2, theta=0, share=0.01, mrkld=0, weight_step=0
+        rounds=1, epochs=1, steps=1, batch_size=2, theta=0, mrkld=0, weight_step=0
     )
-    assert (scheme.epochs, scheme.batch_size, scheme.theta_of(0)) == (1, 2, 0)
+    assert (scheme.epochs, scheme.batch_size, scheme.theta_of(0, np.ones(1))) == (1, 2, 0)
 
 
 def test_the_weight_of_the_losses_stays_above_0():

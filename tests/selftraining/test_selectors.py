@@ -49,11 +49,12 @@ def select(table, theta=0.8, classes=3, **settings):
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, "abghj"),
-        ({"order": "ascending"}, "deghj"),
+        ({"counts": "confident"}, "abghj"),
+        ({"counts": "confident", "order": "ascending"}, "deghj"),
         ({"mu": "one"}, "abcdeghj"),
         # L_k of all samples: 6, 3, 2; mu = 2/8, 5/8, 6/8; quotas ceil(10/8), ceil(10/8), ceil(6/8)
-        ({"counts": "all"}, "abghj"),
+        ({}, "abghj"),
+        ({"floor": 0.5}, "abcghj"),
     ],
 )
 def test_table_worked_by_hand(settings, expected):
@@ -61,7 +62,7 @@ def test_table_worked_by_hand(settings, expected):
 
 
 def test_figures_of_the_table():
-    selection, _ = select(TABLE)
+    selection, _ = select(TABLE, counts="confident")
     assert selection.confident.tolist() == [5, 2, 1]
     assert selection.kept.tolist() == [2, 2, 1]
     assert selection.mu.tolist() == [3 / 8, 6 / 8, 7 / 8]
@@ -69,7 +70,7 @@ def test_figures_of_the_table():
 
 def test_more_predicted_than_confident_is_clamped():
     table = [("a", 0, 0.9), ("b", 1, 0.9), *((f"z{i}", 0, 0.1) for i in range(9))]
-    selection, kept = select(table, classes=2, counts="all")
+    selection, kept = select(table, classes=2)
     assert selection.mu.tolist() == [0.0, 0.5]
     assert kept == "b"
 
@@ -79,7 +80,9 @@ def test_the_paper_s_example_of_a_perfect_teacher():
     sizes = [80, 270, 388, 517, 2070, 130, 164, 71, 391, 807]
     predicted = np.repeat(np.arange(10), sizes)
     ids = [f"{i:05d}" for i in range(len(predicted))]
-    selection = Qbst().select(TeacherPredictions(ids, np.full(len(ids), 0.9), predicted, 10), 0.8)
+    selection = Qbst(counts="confident").select(
+        TeacherPredictions(ids, np.full(len(ids), 0.9), predicted, 10), 0.8
+    )
     assert selection.kept[4] == 1194
     assert abs(int(selection.kept.sum()) - 3740) <= 10
     exact = [math.ceil((1 - Fraction(n, 4888)) * n) for n in sizes]

@@ -15,7 +15,7 @@ import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
 from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.selftraining.cbst import Cbst
-from qs3.selftraining.selectors import Qbst, Random, Spst
+from qs3.selftraining.selectors import Qbst, Random, Spst, TeacherPredictions, most_confident
 from qs3.utils.seeding import derive
 from tests.composing import compose
 from tests.selftraining.test_selectors_balanced import select
@@ -30,7 +30,7 @@ SCHEMES: dict[str, SelfTrainingConfig] = {name: build(_COMPOSED[name]) for name 
 SELECTORS = {name: scheme.selector for name, scheme in SCHEMES.items()} | {
     "sd": replace(SCHEMES["sd"].selector, graph=False),  # the graph needs features: test_sd
     "qbst ascending": Qbst(order="ascending"),
-    "qbst of all": Qbst(counts="all", order="ascending"),
+    "qbst of the confident": Qbst(counts="confident"),
     "cbst half": Cbst(portion=0.5),
     "lrent half": Cbst(portion=0.5, labels="lrent"),
     "random of all": Random(Qbst(), seed=3, pool="all"),
@@ -49,7 +49,9 @@ def ids_of(p: np.ndarray) -> list[str]:
 
 
 def test_all_are_here() -> None:
-    assert {"qbst", "spst", "cbst", "crst_lrent", "crst_mrkld", "random", "confident"} <= {*NAMES}
+    assert {"qbst", "qbst_beside", "qbst_released", "spst", "cbst", "crst_mrkld", "random"} <= {
+        *NAMES
+    }
     assert SCHEMES["crst_mrkld"].mrkld > 0
 
 
@@ -76,7 +78,7 @@ def test_the_order_of_samples_does_not_matter(name, p, theta, round_, rng) -> No
 def test_no_pseudo_label_at_or_below_theta_and_figures_agree(name, p, theta) -> None:
     selection, _ = select(SELECTORS[name], p, theta, ids_of(p))
     labels = p.argmax(axis=1) if selection.labels is None else selection.labels
-    if name != "random of all":
+    if name not in ("random of all", "qbst_beside"):  # which have a pool or a floor beside it
         assert (p[np.arange(len(p)), labels][selection.selected] > theta).all()
     kept = np.bincount(labels[selection.selected], minlength=3)
     assert kept.tolist() == selection.kept.tolist()
@@ -84,7 +86,7 @@ def test_no_pseudo_label_at_or_below_theta_and_figures_agree(name, p, theta) -> 
     assert confident.tolist() == selection.confident.tolist()
 
 
-SURE = {"qbst", "qbst ascending", "qbst of all", "random", "sd"}
+SURE = {"qbst", "qbst ascending", "qbst of the confident", "random", "sd"}
 
 
 @pytest.mark.parametrize("name", sorted(SURE))
@@ -103,8 +105,7 @@ def test_a_net_that_says_1_of_many_is_taken_by_what_it_doubts(name) -> None:
         if name == "random":
             assert order.tolist() not in (sorted(order), sorted(order, reverse=True))
         else:
-            assert order.tolist() == sorted(order, reverse=name.endswith("ascending") or (
-                SELECTORS[name] == SELECTORS["qbst of all"]))  # fmt: skip
+            assert order.tolist() == sorted(order, reverse=name.endswith("ascending"))
 
 
 @every_selector
@@ -143,7 +144,7 @@ def qbst_by_hand(p: np.ndarray, theta: float, ids: list[str], sign: int) -> list
 @pytest.mark.parametrize(("order", "sign"), [("descending", -1), ("ascending", 1)])
 @given(p=tables, theta=thetas)
 def test_qbst_is_its_naive_twin(order, sign, p, theta) -> None:
-    kept = select(Qbst(order=order), p, theta, ids_of(p))[1]
+    kept = select(Qbst(order=order, counts="confident"), p, theta, ids_of(p))[1]
     assert kept == " ".join(qbst_by_hand(p, theta, ids_of(p), sign))
 
 
@@ -155,6 +156,17 @@ def test_qbst_of_all_counts_keeps_just_its_quota(p, theta) -> None:
         mu = max(1 - Fraction(int(counts[k]), n), Fraction(0)) if n else Fraction(0)
         assert float(mu) == pytest.approx(selection.mu[k], abs=1e-12)
         assert selection.kept[k] == math.ceil(mu * int(selection.confident[k]))
+
+
+@given(tables, thetas, st.sampled_from([0.2, 0.5, 1.0]))
+def test_a_floor_adds_the_most_confident_of_each_predicted_class(p, theta, floor) -> None:
+    teacher = TeacherPredictions.of(p, ids_of(p))
+    plain, floored = Qbst().select(teacher, theta), Qbst(floor=floor).select(teacher, theta)
+    least = most_confident(
+        teacher.confidence, teacher.predicted, floor, ids_of(p), teacher.doubt, 1
+    )
+    assert floored.selected.tolist() == (plain.selected | least).tolist()
+    assert ((floored.kept > 0) == (np.bincount(teacher.predicted, minlength=3) > 0)).all()
 
 
 # --- SPST ------------------------------------------------------------------------------------

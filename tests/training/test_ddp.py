@@ -34,6 +34,7 @@ SETTINGS = ("method=source_only", f"protocol.epochs={WARMUP}", "protocol.optimiz
 FEATURED = "model._target_=tests.training.nets.featured"
 LOW = "method.theta=0.3"  # of its selector
 STEPS = "selftraining.selector.steps=3"  # of the graph's net
+LRENT = ("selftraining.selector.labels=lrent", "selftraining.theta=0")
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         # a teacher and a pool of the warm-up, in buffers; the pool is of epoch 1
         (("method=sd", "selftraining=spst", FEATURED), 2),
         (("method=pcfea", "method.every=1.0", "selftraining=spst", FEATURED), 3),
-        (("method=dann", "selftraining=crst_lrent", "selftraining.theta=0", FEATURED), 2),
+        (("method=dann", "selftraining=cbst", *LRENT, FEATURED), 2),
         (("method=cpcm", "selftraining=spst", "evaluation.norms=tent"), 2),
         (("selftraining=sd", "selftraining.theta=0", STEPS, FEATURED), WARMUP + EPOCHS + 1),
     ],

@@ -20,7 +20,7 @@ from qs3.training.command import train
 from tests.training.toy import CLASSES, CONF, toy_config, write_toy
 
 NETS = {"pointdan": "with_nodes"}
-OWN_THRESHOLDS = ("cbst", "crst_lrent", "crst_mrkld", "sd")
+OWN_THRESHOLDS = ("cbst", "crst_mrkld", "sd")
 
 
 def _names(group: str, *but: str) -> list[str]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import open_dict
@@ -41,6 +42,12 @@ class Kept:
 
     def checkpoint(self, epoch: int) -> dict[str, Any]:
         return load(self.kept / f"{epoch}.ckpt")
+
+    def held_out(self, round_: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """As the checkpoint of the round's first epoch has it."""
+        callbacks = self.checkpoint(3 + 2 * round_)["callbacks"]
+        pair: Any = next(v for k, v in callbacks.items() if "ReleasedRounds" in k)["held_out"]
+        return pair
 
     def net(self, epoch: int) -> dict[str, torch.Tensor]:
         """The weights in an epoch's checkpoint."""
@@ -118,6 +125,33 @@ def test_a_persistent_student_is_new_in_round_0_and_kept_afterwards(persistent: 
     assert persistent.before(5)["moments"] > 0
     steps = {e: persistent.checkpoint(e)["optimizer_states"][0]["state"][0]["step"] for e in (4, 5)}
     assert steps[5] > steps[4] > 0
+
+
+@pytest.fixture(scope="module")
+def released(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
+    root = tmp_path_factory.mktemp("released")
+    rounds = ("selftraining=qbst_released", "selftraining.theta=0.35", "selftraining.rounds=3")
+    return kept_run(root, toy_data, *rounds)
+
+
+def test_the_released_rounds_hold_out_a_fifth_of_what_a_pool_gives(released: Kept) -> None:
+    """Only the best student by held-out pseudo-labels teaches, and it is the result."""
+    states = [released.checkpoint(epoch) for epoch in (4, 6, 8)]
+    rounds = [next(v for k, v in s["callbacks"].items() if "ReleasedRounds" in k) for s in states]
+    assert rounds[0]["best"] <= rounds[1]["best"] <= rounds[2]["best"]
+    teachers = [load(released.folder / "warmup_selected.pt"), *(r["weights"] for r in rounds[:2])]
+    for round_, teacher in enumerate(teachers):
+        table = read_pseudo_labels(released.folder / f"round_{round_:02d}" / "pseudo_labels.csv")
+        assert table["label"].tolist() == [row[1] for row in table_by(released, teacher)]
+        pool = np.arange(len(table)) % 10 < 8
+        assert not table["selected"][~pool].any()
+        chosen, (index, _) = table["selected"].sum(), released.held_out(round_)
+        assert len(index) == (np.arange(chosen) % 10 >= 8).sum()
+        assert table["selected"].to_numpy()[index.numpy()].all()
+        trained = released.checkpoint(3 + 2 * round_)["AdaptationData"]["index"]
+        assert not set(trained.tolist()) & set(index.tolist())
+        assert len(trained) + len(index) == chosen
+    assert same(load(released.folder / "student.pt"), rounds[2]["weights"])
 
 
 @pytest.mark.parametrize("name", ["scratch", "continued"])

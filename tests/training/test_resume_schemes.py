@@ -28,11 +28,12 @@ SCHEMES = {
     "qbst": ("selftraining=qbst",),
     "spst": ("selftraining=spst", "selftraining.weight_step=0.1"),
     "cbst": ("selftraining=cbst", FREE),
-    "crst_lrent": ("selftraining=crst_lrent", FREE),
+    "lrent": ("selftraining=cbst", "selftraining.selector.labels=lrent", FREE),
     "crst_mrkld": ("selftraining=crst_mrkld", FREE),
     "random": ("selftraining=random",),
     "sd": ("selftraining=sd", FREE, "selftraining.selector.steps=3", FEATURED),
-    "confident": ("selftraining=confident",),
+    "released": ("selftraining=qbst_released",),
+    "beside": ("selftraining=qbst_beside",),
     "steps": ("selftraining=qbst", "protocol.steps=8", "selftraining.steps=5"),
     "continued_alone": ("selftraining=qbst", "selftraining.init=continue", "selftraining.pcm=true"),
     "pseudo_val": ("selection.student=pseudo_val",),
@@ -49,7 +50,6 @@ METHODS = {
     "cpcm": ("method=cpcm",),
     "mlsp": ("method=mlsp", FEATURED),
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
-    "pcfea_qbst": ("method=pcfea_qbst", FEATURED),
     "supervised": ("method=supervised",),
     "own": ("method=own", f"method.file={OWN}"),
 }
