@@ -21,7 +21,7 @@ DATASETS = (
     f"generate.py domain=modelnet10 {MESHES}",
     f"generate.py domain=specklenet10 {MESHES} views=3"
     " sensor=speckle_stereo_small renderer.samples=4",
-    "generate.py domain=kinectsim10 fraction=0.35 views=3 renderer.samples=4",
+    "generate.py domain=kinectsim10 fraction=0.35 views=3",
 )
 
 

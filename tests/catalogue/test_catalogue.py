@@ -52,6 +52,13 @@ def test_a_split_uses_its_families_evenly():
             assert sum(counts) == 60  # hence no family of the other split
 
 
+def test_shared_families_are_in_both_splits_and_their_meshes_in_one():
+    items = Catalogue(train=40, test=40, classes=("lamp",), families="shared").items()
+    used = {split: {i.origin for i in items if i.split == split} for split in ("train", "test")}
+    assert used["train"] == used["test"] == {f"catalogue:lamp/{f.name}" for f in families("lamp")}
+    assert len({item.load().sha256 for item in items}) == 80
+
+
 def test_every_class_has_families_for_both_splits():
     for cls in CLASSES:
         split = Counter(family.split for family in families(cls))

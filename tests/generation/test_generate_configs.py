@@ -16,7 +16,7 @@ from tests.generation.generating import composed as config
 DOMAINS = (
     *("specklenet10", "specklenet10_clean", "blensor10", "kinectsim10"),
     *("modelnet10", "modelnet10_dropout"),
-    *("specklenet10_view", "rooms10", "kinectsim10_full"),
+    *("specklenet10_view", "rooms10", "kinectsim10_full", "kinectsim10_shifted"),
 )
 
 
@@ -69,15 +69,16 @@ def test_benchmarks_know_themselves_and_their_parts():
 
     The objects of a part are those of the whole, byte for byte: each has a seed of its own.
     """
-    assert benchmark() == "kinectsim10 v2"
-    assert benchmark("renderer.threads=2", "renderer.variant=scalar_rgb") == "kinectsim10 v2"
-    for other in ("fraction=0.5", "views=3", "renderer.samples=4", "recipe.min_points=100"):
-        assert benchmark(other).startswith("like kinectsim10 v2, but not it")
-    assert benchmark("splits=[train]", other).startswith("like kinectsim10 v2, but not it")
-    assert benchmark("splits=[train]") == "kinectsim10 v2, train"
+    assert benchmark() == "kinectsim10 v3"
+    assert benchmark("renderer.threads=2", "renderer.variant=scalar_rgb") == "kinectsim10 v3"
+    for other in ("fraction=0.5", "views=3", "renderer.samples=16", "recipe.min_points=100"):
+        assert benchmark(other).startswith("like kinectsim10 v3, but not it")
+    assert benchmark("splits=[train]", other).startswith("like kinectsim10 v3, but not it")
+    assert benchmark("splits=[train]") == "kinectsim10 v3, train"
     assert benchmark(domain="rooms10") == "rooms10 v2"
     assert benchmark("recipe.by_class=0", domain="rooms10").startswith("like rooms10 v2, but")
-    assert benchmark(domain="kinectsim10_full") == "kinectsim10_full v1"
+    assert benchmark(domain="kinectsim10_full") == "kinectsim10_full v2"
+    assert benchmark(domain="kinectsim10_shifted") == "kinectsim10_shifted v1"
 
 
 def own_meshes(root, **counts):
