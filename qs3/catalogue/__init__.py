@@ -16,6 +16,8 @@ from qs3.meshes.mesh import Mesh, MeshItem, merge
 from qs3.utils.settings import settings
 
 Count = Annotated[int, Ge(0)]
+FAMILY = "catalogue:"
+"""Before class and family in an object's origin."""
 
 
 @settings
@@ -58,7 +60,7 @@ class Catalogue:
             cls=cls,
             split=split,
             load=partial(make, cls, family, f"{self.seed}/{split}/{index}"),
-            origin=f"catalogue:{cls}/{family}",
+            origin=f"{FAMILY}{cls}/{family}",
         )
 
 

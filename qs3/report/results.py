@@ -30,6 +30,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int
 
+from qs3.catalogue import FAMILY
 from qs3.datasets.object_archive import TIERS
 from qs3.errors import DataError
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
@@ -61,7 +62,8 @@ NO_RUNS = pd.DataFrame([{"seed": 0, **dict.fromkeys(_SEEN, ""), **_UNKNOWN}])[:0
 
 _FOLDER = re.compile(r"seed(\d+)-([0-9a-f]+)")
 _BLOCK = re.compile(r"(?:\w+_)?block\d+")  # as importers of frames name them
-MESHES, BLOCKS, ROOMS, CLOUDS = "meshes", "blocks of frames", "rooms", "clouds"
+MESHES, FAMILIES = "meshes", "families of meshes"
+BLOCKS, ROOMS, CLOUDS = "blocks of frames", "rooms", "clouds"
 """What test clouds of one cluster share; of `CLOUDS` it is not known, each counts by itself."""
 
 
@@ -183,6 +185,8 @@ def answers_of(run: Mapping[str, Any]) -> Answers:
     are = ROOMS if found.tiers else MESHES
     if all(_BLOCK.fullmatch(name) for name in found.meshes):
         are = BLOCKS
+    elif all(name.startswith(FAMILY) for name in found.meshes):
+        are = FAMILIES
     elif found.meshes == found.ids:
         are = CLOUDS
     clusters = np.unique(found.meshes, return_inverse=True)[1]

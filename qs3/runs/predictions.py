@@ -1,9 +1,10 @@
 """A run's predictions on disk, as CSV.
 
-predictions.csv, of the target's evaluated clouds: id; mesh (hash of the object's mesh: scans of one
-mesh are not independent samples; of objects of frames their room, or their block of frames; the id
-where neither is known); label (empty if it is not known); predicted; tier ("clean" or "hard", where
-the dataset has tiers: else there is no such column); and a probability per class.
+predictions.csv, of the target's evaluated clouds: id; mesh (what clouds have in common, so that
+they are not independent samples: the structural family of an object of the catalogue, else the hash
+of its mesh; of objects of frames their room, or their block of frames; the id where nothing is
+known); label (empty if it is not known); predicted; tier ("clean" or "hard", where the dataset has
+tiers: else there is no such column); and a probability per class.
 
 round_03/pseudo_labels.csv, of a round's target clouds: id, label, confidence, selected.
 """

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 
+from qs3.catalogue import FAMILY
 from qs3.config.hydra import build
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.clouds import Clouds, labels_of, load_clouds
@@ -175,11 +176,18 @@ def prior_beside(
 
 
 def objects_by_id(rows: Sequence[ManifestRow], domain: Domain) -> dict[str, str]:
-    """What each cloud shows: its mesh, or what the publisher's ids tell; where that is known."""
+    """What clouds have in common, so that they are not independent samples; where it is known.
+
+    The structural family of the catalogue's objects, or their mesh, or what a publisher's ids say.
+    """
     importer = domain.importer()
-    known = {
-        row.id: row.mesh_sha256 or (importer.object_of(row.id) if importer else "") for row in rows
-    }
+
+    def of(row: ManifestRow) -> str:
+        if row.origin.startswith(FAMILY):
+            return row.origin
+        return row.mesh_sha256 or (importer.object_of(row.id) if importer else "")
+
+    known = {row.id: of(row) for row in rows}
     return {id_: name for id_, name in known.items() if name}
 
 
