@@ -30,8 +30,10 @@ def test_only_what_is_missing_is_run(tmp_path):
 def test_long_runs_begin_first(tmp_path):
     table = build_table("quickstart", tmp_path)
     names = [job.name for job in missing(table, [0, 1])]
-    assert names[:2] == [f"QS3 = PCM + QBST, speckle scans, seed {seed}" for seed in (0, 1)]
-    assert len(names) == 6  # PCM's row shows a part of QS3's runs
+    assert names[:2] == [
+        f"QS3 = PCM + QBST as released, speckle scans, seed {seed}" for seed in (0, 1)
+    ]
+    assert len(names) == 8  # PCM's row shows a part of QS3's runs
 
 
 def test_names():
