@@ -80,7 +80,7 @@ def table(build: Callable[..., Table], *, out: _Out = None) -> None:
     what the runs were measured on, and the commands that fill empty cells.
 
     Example:
-        qs3 report table=headline kept=docs/results/headline.csv.gz
+        qs3 report table=cad10 kept=docs/results/cad10.csv.gz
         qs3 report table=uda target=kinectsim10 overrides="trainer=gpu data.points=512"
     """
     from qs3.report.formats import csv_text, markdown, save, text
@@ -147,7 +147,7 @@ def compare(
 
     Example:
         qs3 report compare table=cad10 base="source only" kept=docs/results/cad10.csv.gz
-        qs3 report compare table=headline kept=docs/results/headline.csv.gz
+        qs3 report compare table=cad10 kept=docs/results/cad10.csv.gz
     """
     from qs3.report.comparison import against, effects, row_of, text
 

@@ -11,7 +11,6 @@ from tests.running import ROOT
 RESULTS = ROOT / "docs" / "results"
 TABLES = [
     ("cad10", "cad10", None, "cad10"),
-    ("headline", "headline", None, "headline"),
     ("real", "real", "objects", "real"),
     ("leaderboard", "leaderboard", None, "leaderboard"),
     ("leaderboard", "leaderboard_second", None, "leaderboard"),
