@@ -11,7 +11,7 @@ import pytest
 
 needs_triton = pytest.mark.skipif(
     find_spec("triton") is None,
-    reason="Triton is missing: docs/reference/accelerators.md says how to bring it",
+    reason="Triton is missing: `make test-triton` fetches it",
 )
 
 

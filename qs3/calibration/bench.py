@@ -4,8 +4,8 @@
 
 renders planes and a square in front of a wall with the sensor's own settings, and measures what
 comes back: planes.csv, edges.csv, bands.csv (what must hold, and whether it does), and a page of
-them, index.md. The limits of bands come from devices or from geometry, never from what a sensor of
-ours happened to give.
+them, sensors.md. The limits of bands come from devices or from geometry, never from what a sensor
+of ours happened to give.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def write(
     text = page.from_string(template).render(
         sensors=lines, bands=bands, depths_m=_SHOWN_M, tilts_deg=_SHOWN_DEG
     )
-    write_text(folder / "index.md", text + "\n")
+    write_text(folder / "sensors.md", text + "\n")
     return bands
 
 
@@ -113,7 +113,7 @@ def _line(name: str, rows: pd.DataFrame, bands: Sequence[Band]) -> dict[str, obj
     sigma, fill = facing.set_index("depth_m").sigma_m, rows.groupby("tilt_deg").fill.mean()
     return {
         "name": name,
-        "holds": f"{sum(band.holds for band in own)} of {len(own)}",
+        "holds": f"{sum(band.holds for band in own)}/{len(own)}",
         "p": f"{exponent(facing):.2f}",
         "sigma_mm": [f"{1e3 * sigma[z]:.2f}" if z in sigma else "-" for z in _SHOWN_M],
         "fill": [f"{100 * fill[t]:.0f}" if t in fill else "-" for t in _SHOWN_DEG],

@@ -16,8 +16,8 @@ def bench(
 ) -> int:
     """Measure depth sensors before known targets: are their errors those of the device?
 
-    Renders planes and an edge, and writes a page (index.md) and all numbers (planes.csv, edges.csv,
-    bands.csv). The exit status is 1 if a band does not hold.
+    Renders planes and an edge, and writes a page (sensors.md) and all numbers (planes.csv,
+    edges.csv, bands.csv). The exit status is 1 if a band does not hold.
 
     Example:
         qs3 bench sensor=kinect_v1,realsense_d435 quick=true
@@ -29,7 +29,7 @@ def bench(
     failed = [band for band in run(sensor, words, quick, samples, out) if not band.holds]
     for band in failed:
         print(f"FAIL {band.sensor}: {band.band}: {band.value:.3g} ({band.low:g} to {band.high:g})")
-    print(f"saved {out / 'index.md'}, planes.csv, edges.csv and bands.csv")
+    print(f"saved {out / 'sensors.md'}, planes.csv, edges.csv and bands.csv")
     return 1 if failed else 0
 
 

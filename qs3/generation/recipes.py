@@ -82,7 +82,7 @@ class BoxCrop:
 
     The released code has no margin: of a face that lies in the box's side only the errors that
     point inwards survive. 3 cm are 4.7 standard deviations of the paper's sensor at 3 m, 1.67 at
-    5 m (docs/sensors/planes.csv).
+    5 m (docs/reference/planes.csv).
     """
 
     margin_m: NotNegative = 0.03

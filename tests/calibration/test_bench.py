@@ -18,7 +18,7 @@ from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.running import main
 
-DOCS = Path(__file__).parents[2] / "docs" / "sensors"
+DOCS = Path(__file__).parents[2] / "docs" / "reference"
 KINECT = Subject("kinect_like", ReferenceSpeckle())
 STEREO = Subject("speckle_stereo", SpeckleStereo())
 GEOMETRY = {
@@ -156,7 +156,7 @@ def test_the_command_writes_its_page_and_numbers(tmp_path):
     assert status == int(not bands.holds.all())
     assert len(rows) == len(KINECT.depths_m()) + 4
     assert rows.fill[rows.tilt_deg == 0].between(0.9, 1).all()
-    assert f"{bands.holds.sum()} of {len(bands)}" in (tmp_path / "index.md").read_text()
+    assert f"{bands.holds.sum()}/{len(bands)}" in (tmp_path / "sensors.md").read_text()
     assert main(["bench", "sensor=nothing"]) == 1
 
 
@@ -166,5 +166,5 @@ def test_the_page_in_docs_is_that_of_its_numbers(tmp_path):
     square = pd.read_csv(DOCS / "edges.csv")
     subjects = [load(name) for name in bench.DEFAULT_SENSORS]
     bench.write(subjects, flat, square, tmp_path)
-    assert (tmp_path / "index.md").read_text() == (DOCS / "index.md").read_text()
+    assert (tmp_path / "sensors.md").read_text() == (DOCS / "sensors.md").read_text()
     assert (tmp_path / "bands.csv").read_text() == (DOCS / "bands.csv").read_text()
