@@ -109,7 +109,7 @@ class Qbst:
     r"""Quasi-balanced self-training (QS3, section 3.2): the rarer a class, the more of it is kept.
 
     With A = {i : p_i > theta}, n = |A| and n_k = |{i in A : k_i = k}|, class k keeps the
-    ceil(mu_k n_k) most confident of its samples in A, where mu_k = 1 - n_k / n.
+    ceil(mu_k n_k) most confident of its samples in A, where mu_k = 1 - L_k / n.
 
     Attributes:
         mu: "balanced" as above; "one" keeps every confident sample (a control).
