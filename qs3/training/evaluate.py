@@ -56,7 +56,7 @@ log = logging.getLogger(__name__)
 TRAINED = "trained"
 ADAPTERS: dict[str, Callable[..., None]] = {
     "adabn": adapt_norms,
-    "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/tried.md
+    "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/index.md
     "tent": minimise_entropy,
 }
 """Values of `evaluation.norms` (`qs3.training.run.Judging`), beside "trained"."""
