@@ -24,7 +24,7 @@ def train(*overrides: str) -> Path:
     """Train a run as `python train.py <overrides>` does, in this process; returns its folder.
 
     `qs3.report.run_page.read_run` and `qs3.load` read it. A finished run is not trained again. One
-    seed at a time: there is no `-m` here. Errors are those of the command.
+    seed at a time: `-m` does not exist here. Errors are those of the command.
     """
     from omegaconf import OmegaConf
 

@@ -184,7 +184,7 @@ def _samples(start: int, length: int, first: int, step: int) -> slice:
 
 
 def _measured(frame: DepthFrame, part: tuple[slice, slice], fb: float | None) -> dict[str, Any]:
-    """Of one frame: [N] errors; [h, w] residuals from the fitted plane with NaN."""
+    """Errors of one frame: [N] errors; [h, w] residuals from the fitted plane with NaN."""
     depth, clean = (a[part].astype(np.float64) for a in (frame.depth_m, frame.clean_m))
     wanted = np.isfinite(clean)
     valid = wanted & np.isfinite(depth)
@@ -236,7 +236,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def median(values: np.ndarray) -> float:
-    """Of what is finite; NaN of nothing."""
+    """Median of what is finite; NaN without any."""
     good = values[np.isfinite(values)]
     return float(np.median(good)) if good.size else np.nan
 

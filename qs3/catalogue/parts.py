@@ -1,6 +1,6 @@
 """Primitives: every function returns one closed 2-manifold, its faces oriented outwards.
 
-Metres, z up. `at` is the centre of the part's lower face unless said otherwise. Nearly all
+Metres, z up. `at` is the centre of the part's lower face unless noted otherwise. Nearly all
 solids are lofts: a stack of rings of equally many points, closed by a fan at both ends.
 """
 

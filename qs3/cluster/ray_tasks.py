@@ -62,7 +62,7 @@ class RayTasks:
 
     @property
     def at_once(self) -> int:
-        """Of a cluster that is connected, as many as its cores allow."""
+        """Tasks at once of a cluster that is connected, as many as its cores allow."""
         if (ray := sys.modules.get("ray")) is None or not ray.is_initialized():
             return self.workers
         has = ray.cluster_resources()
@@ -74,7 +74,7 @@ class RayTasks:
 
         Raises:
             ConfigError: no node of the cluster has what a task asks for.
-            ConnectionError: Ray's, if there is no cluster at the address.
+            ConnectionError: Ray's, if the address has no cluster.
         """
         import ray
 

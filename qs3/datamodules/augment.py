@@ -113,7 +113,7 @@ def crop(
     """Cut each cloud by a plane of any direction, so that U(least, 1) of its points stay.
 
     What stays is put where `scale` has it: centred again, in the unit ball scaled again, as a cloud
-    of which nobody has ever seen the rest; over the floor it keeps its height. Points of it are
+    whose rest was never seen; over the floor it keeps its height. Points of it are
     repeated at random in the places of the others.
     """
     b, n = points.shape[:2]

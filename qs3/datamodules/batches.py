@@ -1,6 +1,6 @@
 """Batches drawn from clouds, in an order that is a function of (seed, epoch).
 
-There are no worker processes: a batch is one indexing into mapped files, and augmentation happens
+It has no worker processes: a batch is one indexing into mapped files, and augmentation happens
 on the device. So there is nothing that the number of workers could change.
 """
 

@@ -72,7 +72,7 @@ class Clouds:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Of these n clouds."""
+        """Ids of these n clouds."""
         return tuple(self.names[row] for row in self.rows)
 
     @property
@@ -139,7 +139,7 @@ class Labelled:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Of the clouds."""
+        """Ids of the clouds."""
         return self.clouds.ids
 
     def at(self, index: Int[np.ndarray, " k"]) -> Labelled:

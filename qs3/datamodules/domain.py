@@ -44,7 +44,7 @@ class DomainData(LightningDataModule):
         sampler: "shuffled" trains on each cloud once an epoch, "balanced", which takes labels, on
             as many of each class.
         seed: of order, samples and augmentation, each a function of (seed, epoch).
-        labels: False reads no label and keeps none; then there are no validation clouds.
+        labels: False reads no label and keeps none; then it has no validation clouds.
         cache_dir: where farthest points are kept for the next time; None keeps none.
         clouds_a_split: only so many clouds of each split, at even steps.
         clouds_a_class: train on the first so many clouds of each class alone, and validate on at
@@ -60,7 +60,7 @@ class DomainData(LightningDataModule):
     Raises:
         ConfigError, DataError: no such domain, no clouds for training or of such a scale, no labels
             where they are asked for.
-        MissingDataError: from `prepare_data`, if there are no files; says how to get them.
+        MissingDataError: from `prepare_data`, if files are missing; says how to get them.
     """
 
     def __init__(

@@ -32,6 +32,6 @@ def lineage(ids: Sequence[str]) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, 
 def first_of_class(
     index: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"], count: int
 ) -> Int[np.ndarray, " k"]:
-    """Of some positions in `labels` the first `count` of each class."""
+    """The first `count` of each class among some positions in `labels`."""
     left = [np.flatnonzero(labels[index] == k)[:count] for k in np.unique(labels[index])]
     return index[np.sort(np.concatenate(left))]

@@ -184,7 +184,7 @@ def cut(
     The mask loses `edge_px` pixels (None: `rules.erode_px`) of its edge, where labels and depth do
     not agree to the pixel. What is measured of the rest is split where the depth jumps, and the
     largest piece stays with those that are near it in space. `cls` chooses the limits. Without any
-    depth there are no points.
+    depth it has no points.
     """
     mask = mask & image.inside
     measured, core = measured_pixels(image, mask, rules, edge_px)

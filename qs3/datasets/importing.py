@@ -109,7 +109,7 @@ class Importer(abc.ABC):
         return self.made
 
     def object_of(self, id_: str) -> str:
-        """Which object a cloud shows, where its id tells; else "".
+        """Which object a cloud shows, where its id shows it; else "".
 
         `qs3.report.intervals` takes clouds of one object together: they are not independent.
         """

@@ -225,7 +225,7 @@ def in_box(
     own = within >= np.maximum(_OWN * everywhere, 1)
     if (within * own).max() < max(0.05 * within.max(), _LEAST_PX):
         result[at] = inside & left_over
-        words = "what lies in the box goes on outside of it; a mask tells more than a box"
+        words = "what lies in the box goes on outside of it; a mask shows more than a box"
         return result, (Fault(BOX, words),)
     number = np.where(inside & np.isin(number, np.flatnonzero(own)), number, -1)
     fits = (within * own).astype(np.float64)

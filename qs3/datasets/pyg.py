@@ -27,7 +27,7 @@ from qs3.store.store import PointSet, write_pointset
 class Clouds(InMemoryDataset):
     """Clouds as PyG has them: `Data(pos=[P, 3] float32, y=[1] int64, id=str)`, in our order.
 
-    Without labels there is no `y`, else a position in the tuple of names `classes`.
+    Without labels `y` is missing, else a position in the tuple of names `classes`.
     """
 
     def __init__(self, clouds: PointSet, transform: Callable[[Data], Data] | None = None) -> None:

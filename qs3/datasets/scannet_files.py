@@ -63,7 +63,7 @@ INSTANCES, LABELS = "instance-filt", "label-filt"
 SUFFIXES: tuple[str, ...] = (
     ".sens", f"_2d-{INSTANCES}.zip", f"_2d-{LABELS}.zip", ".aggregation.json",
 )  # fmt: skip
-"""Of the files of a scene, after its name."""
+"""Endings of the files of a scene, after its name."""
 
 _CLASS_OF = {name: ALIASES.get(name, name) for name in NAMES}
 _SCENE = re.compile(r"scene\d{4}_\d{2}")

@@ -106,7 +106,7 @@ def scores(
 
     A class without clouds has recall None and is left out of the balanced accuracy. The majority
     rate is what always naming the commonest class would reach. Without labels there are counts of
-    the predictions alone; of a net that has diverged there is no calibration error.
+    the predictions alone; a diverged net has no calibration error.
     """
     predicted, k = probabilities.argmax(axis=1), len(classes)
     if labels is None:

@@ -40,7 +40,7 @@ ERROR = 0.11
 """Mean of |expected - true accuracy| over the pairs, by weights that did not see their targets."""
 
 FEWEST = 30
-"""Of fewer clouds nothing is said: a mean confidence is too rough."""
+"""With fewer clouds a mean confidence is too rough for an estimate."""
 
 _EDGE = 0.02  # shares nearer to 0 or 1 count as this
 _LEAST_T, _MOST_T, _TINY = 0.05, 20.0, 1e-300
@@ -67,7 +67,7 @@ def held_out(
 def expected_accuracy(
     known: HeldOut | None, probabilities: Float[np.ndarray, "n c"]
 ) -> float | None:
-    """The share of these answers that is expected to be right; None if nothing can be said."""
+    """The expected share of right answers; None where it cannot be estimated."""
     if known is None or len(probabilities) < FEWEST or not np.isfinite(probabilities).all():
         return None
     sure = float(scaled(probabilities, known.temperature).max(axis=1).mean())

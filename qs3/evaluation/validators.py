@@ -152,7 +152,7 @@ def chosen_in_words(chosen: str) -> str:
 
 
 def check_objective(objective: Any) -> None:
-    """Raise ConfigError of what a search must not look at; None: there is no search.
+    """Raise ConfigError of what a search must not look at; None: no search runs.
 
     By `pseudo_val` each trial would be judged on clouds that it selected itself.
     """

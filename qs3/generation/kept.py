@@ -61,7 +61,7 @@ class Keep:
 
     Attributes:
         provenance: add the array "provenance" to the cloud.
-        view: takes each view as `save_view` does, from its object's id on; None: nobody does. With
+        view: takes each view as `save_view` does, from its object's id on; None drops them. With
             it views are scanned with `explain`, which costs renders.
     """
 

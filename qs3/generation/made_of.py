@@ -69,7 +69,7 @@ def _sensor(cfg: DictConfig) -> str:
 
 
 def _own_preset() -> str:
-    """The name of a sensor's file that lies beside conf, and what was changed; "" if in conf."""
+    """The name of a sensor's file that lies next to conf, and what was changed; "" if in conf."""
     if not HydraConfig.initialized():
         return ""
     hydra = HydraConfig.get()

@@ -143,7 +143,7 @@ class Mesh2Point:
             few: a matcher's patches make thin parts wide, the true depth does not.
         poses: from a file, in place of `placing` and of `views` (whose count is kept).
         materials: of the bodies; None: as the scene has them, matt.
-        light: beside the sensor's own; None: none.
+        light: in addition to the sensor's own.
         box_of_corners: crop by the box of the turned corners of the mesh's own box, as the
             released code does, and not by the object's own axis-aligned box.
     """

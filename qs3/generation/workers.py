@@ -120,7 +120,7 @@ def has_part(parts: PartFiles, item_id: str) -> bool:
 
 
 def _name(item_id: str) -> str:
-    """Of a part's file: ids are longer than names of files may be."""
+    """Name of a part's file: ids are longer than names of files may be."""
     return hashlib.sha256(item_id.encode()).hexdigest()[:32]
 
 
@@ -180,7 +180,7 @@ class _Scanner:
 
 
 def _inspector(job: Job) -> Callable[[None], tuple[dict[str, str], dict[str, str]]]:
-    """A worker that tells which renderer it has, and what it found out about the machine."""
+    """A worker that reports its renderer and what it found out about the machine."""
     renderer = job.make_renderer()
 
     def inspect(_: None) -> tuple[dict[str, str], dict[str, str]]:
@@ -191,7 +191,7 @@ def _inspector(job: Job) -> Callable[[None], tuple[dict[str, str], dict[str, str
 
 
 def software() -> dict[str, str]:
-    """What decides the bytes of a cloud beside the renderer, of this machine."""
+    """What else of this machine, besides the renderer, decides the bytes of a cloud."""
     return {
         **{name: version(name) for name in _LIBRARIES},
         "python": platform.python_version(),

@@ -157,7 +157,8 @@ def _command(run: Path) -> str:
 def export(predictor: Predictor, out: Path, clouds: int = 32) -> str:
     """Write the net to `out`, read it back, and compare it with the net on clouds that are made up.
 
-    Where torch cannot export the net, or the logits differ, there is no file and a Qs3Error.
+    Where torch cannot export the net, or the logits differ, it writes no file and raises a
+    Qs3Error.
     """
     if out.suffix not in EXPORTED:
         raise ConfigError(f"out={out} must end in {' or '.join(EXPORTED)}, or be a folder")

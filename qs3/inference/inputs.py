@@ -252,7 +252,7 @@ def pointed(
 def around(
     depth_m: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Of both the part that is shown, copied: a frame need not be kept for one object."""
+    """Copies of the part of both that is shown: a frame need not be kept for one object."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     side = max(np.ptp(rows), np.ptp(columns)) + 1
     half = int(side * (0.5 + _MARGIN)) + 4

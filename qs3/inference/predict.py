@@ -133,7 +133,7 @@ def as_csv(samples: Sequence[Sample], classes: Sequence[str]) -> str:
 
 
 def right(one: Sample, classes: Sequence[str]) -> bool | None:
-    """Whether the net is right; None if there is no prediction, or no label of its classes."""
+    """Whether the net is right; None without a prediction or a label of its classes."""
     return one.cls == one.label if one.cls and one.label in classes else None
 
 
@@ -143,7 +143,7 @@ def disputed(one: Sample) -> bool:
 
 
 def kinds(one: Sample) -> list[str]:
-    """What was wrong with a cloud, or with what is said of it, in a few words each."""
+    """What was wrong with a cloud or its label, in a few words each."""
     strange = [STRANGE] * bool(one.cls and one.reason)
     return [*(caution.kind for caution in one.cautions), *strange, *[DISPUTED] * disputed(one)]
 

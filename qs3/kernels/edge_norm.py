@@ -86,7 +86,7 @@ def edge_output(
     eps: float,
     negative_slope: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of `best` and the sums [2, d] of its parts: the layer's output.
+    """From `best` and the sums [2, d] of its parts: the layer's output.
 
     Returns:
         y, t: [r, d] each.
@@ -115,7 +115,7 @@ edge_output.register_fake(
 def edge_output_gradient(
     grad: Tensor, y: Tensor, t: Tensor, constants: Tensor, negative_slope: float
 ) -> tuple[Tensor, Tensor]:
-    """Of the gradient of y [r, d]: du, that before LeakyReLU, and parts of dbeta and dgamma.
+    """From the gradient of y [r, d]: du, that before LeakyReLU, and parts of dbeta and dgamma.
 
     The parts are sums over some points, [2, parts, d].
     """

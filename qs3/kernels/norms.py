@@ -6,7 +6,7 @@
 - "domain": a whole batch norm for each domain, statistics and affine, as in DSBN (Chang et al.,
   "Domain-Specific Batch Normalization for Unsupervised Domain Adaptation", CVPR 2019, eq. 3).
 
-Which domain a pass is on is said around it: `with use_domain(net, "target"): net(points)`; in
+A pass is marked as being on a domain by `with use_domain(net, "target"): net(points)`; in
 evaluation `use_trained` instead.
 """
 
@@ -237,7 +237,7 @@ def adapt_batchnorm(
         The adapted norms.
 
     Raises:
-        ConfigError: there is no norm.
+        ConfigError: the net has no norm.
     """
     check_has_norms(net, "adabn")
     norms = running_norms(net)

@@ -31,7 +31,7 @@ def max_over_rows(x: Float[Tensor, "b n c"]) -> tuple[Float[Tensor, "b c"], Int[
     """`x.max(1)`: values and the first rows that have them, about ten times faster on the CPU.
 
     Pooling of an image in channels-last layout is the only maximum of torch on the CPU that is
-    vectorised and tells where it was. On other devices it is any row that has the value.
+    vectorised and returns its place. On other devices it is any row that has the value.
     """
     if not fast.on_cpu(x):
         return x.max(1)

@@ -60,7 +60,7 @@ class RealSize:
 
 
 def largest_side(mesh: Mesh) -> float:
-    """Of its box, in the mesh's own unit."""
+    """Largest side of the mesh's box, in the mesh's own unit."""
     low, high = mesh.bounds
     side = float((high - low).max())
     if side <= 0:

@@ -3,7 +3,7 @@
 trimesh 5.2 gives other triangles of them, silently:
 
 - OFF: it reads a file whose last faces were cut off, and crashes on a pentagon or a larger polygon
-  beside any other (http://www.geomview.org/docs/html/OFF.html).
+  next to any other (http://www.geomview.org/docs/html/OFF.html).
 - OBJ: it takes indices relative to the end of the list so far ("f -3 -2 -1") as relative to the end
   of the file. The format has no counts, so a file that was cut between two faces is not noticed.
 - STL, which it reads: it leaves out what is damaged in a text, as a solid without its end.

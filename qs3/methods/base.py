@@ -76,7 +76,7 @@ def total_loss(method: nn.Module, terms: dict[str, Tensor]) -> Float[Tensor, ""]
     """The sum of the terms of a method's loss.
 
     Raises:
-        ConfigError: one is no scalar: a loss of each cloud would be summed, not averaged.
+        ConfigError: one is not a scalar: a loss of each cloud would be summed, not averaged.
     """
     for name, term in terms.items():
         if term.ndim:

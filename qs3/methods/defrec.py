@@ -125,7 +125,7 @@ class DefRec(Method):
 
     L_s is the cross-entropy of source clouds, or PCM's of mixed ones. One voxel of each cloud is
     deformed (`deform`); h, a map of each point with features of point and cloud,
-    tells where its points had been. The mean is over the clouds that have a voxel to deform (the
+    shows where its points had been. The mean is over the clouds that have a voxel to deform (the
     released code divides zero by zero for one without).
 
     Args:

@@ -25,7 +25,7 @@ def own(file: str, sha256: str, **settings: Any) -> Method:
         settings: of the class's `__init__`.
 
     Raises:
-        MissingDataError: there is no such file.
+        MissingDataError: the file does not exist.
         ConfigError: its content is another one, it has no such class or several, or it asks for
             labels of the target.
     """

@@ -2,7 +2,7 @@
 
 For nets such as Uni3D, OpenShape or ULIP-2, through a file of the user's own: [B, N, 3] float32
 clouds to [B, D] features. An ONNX file holds a graph of known operations and numbers, no code: it
-is run by onnxruntime from the bytes whose SHA-256 is in the run's config, and files beside it that
+is run by onnxruntime from the bytes whose SHA-256 is in the run's config, and files next to it that
 it names are not read. Features of a run's clouds are computed once (`remember`) and kept on disk,
 under the hash of the file and of the clouds; any other cloud is computed when it comes.
 """

@@ -128,7 +128,7 @@ class PointNet2(Backbone):
         self.last = GroupedMLP(channels, (256, 512, 1024), norm=norm)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
-        """[B, 1024]; there are no features of all N points."""
+        """[B, 1024]; it has no features of all N points."""
         xyz, features = points, None
         for level in self.levels:
             xyz, features = level(xyz, features)

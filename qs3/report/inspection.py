@@ -254,7 +254,7 @@ def contact_sheet(
 ) -> Figure:
     """A sheet of clouds [P, 3], z up; `words` as of `qs3.utils.pictures.sheet`.
 
-    What lies beside the origin is seen from there, a little from the side: that is where a single
+    What lies off the origin is seen from there, a little from the side: that is where a single
     view has its camera.
     """
     images: list[Image | None] = []

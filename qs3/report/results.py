@@ -171,7 +171,7 @@ class Answers:
 
 
 def answers_of(run: Mapping[str, Any]) -> Answers:
-    """Of a line of the frame, or of the predictions in its folder."""
+    """Answers of a line of the frame, or of the predictions in its folder."""
     if run.get("called"):
         labels, called, clusters = (
             np.array(run[key].split(), dtype=int) for key in ("labels", "called", "clusters")
@@ -226,7 +226,7 @@ class Runs:
 
     @property
     def seeds(self) -> list[int]:
-        """Of the finished runs."""
+        """Seeds of the finished runs."""
         return self.finished.seed.tolist()
 
     def stat(self, score: str) -> Stat | None:

@@ -243,7 +243,7 @@ def _curves(run: RunFiles, history: pd.DataFrame) -> Figure:
 
 
 def pseudo_labels(rounds: Sequence[RoundRecord], classes: Sequence[str]) -> pd.DataFrame:
-    """Of each round (column): by class selected/confident and mu or the threshold; theta.
+    """A table of each round (column): by class selected/confident and mu or the threshold; theta.
 
     And what they are worth: precision and recall know the target's labels, which judge alone.
     """

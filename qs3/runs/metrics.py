@@ -142,7 +142,7 @@ class StudentChoice:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Quality:
-    """What can be said of the reported net on the evaluated clouds without their labels.
+    """What can be estimated of the reported net on the evaluated clouds without their labels.
 
     Attributes:
         validation_accuracy: on held-out labelled clouds.
@@ -234,7 +234,7 @@ class RunMetrics:
 
     @property
     def diverged(self) -> bool:
-        """Whether the reported net's predictions are no numbers: every cloud is of class 0 then."""
+        """Whether the predictions are not numbers: every cloud is of class 0 then."""
         return self.validators.get("entropy", 0.0) is None
 
     @property
@@ -255,7 +255,7 @@ class RunMetrics:
     def domains(self) -> dict[str, MadeOf]:
         """By name what each domain is made of, the source first; only one if they are the same.
 
-        Two of one name, as of two folders of own clouds, are told apart by what they are for.
+        Two of one name, as of two folders of own clouds, are distinguished by what they are for.
         """
         source, target = self.made_of.source, self.made_of.target
         if self.source == self.target and source != target and self.method != "supervised":

@@ -8,7 +8,7 @@ At the end of a phase's last epoch (`on_train_epoch_end`) the teacher labels the
 training split, and the selected part becomes the datamodule's next training set. Weights and
 optimiser are reset at the start of the next epoch (`on_train_epoch_start`), not before:
 checkpoints are written in between, and must hold the trained model. Whether a reset is due
-follows from the epoch alone, so there is no flag that a resume could lose.
+follows from the epoch alone, so no flag can be lost by a resume.
 """
 
 import dataclasses
@@ -181,7 +181,7 @@ class SelfTraining(Callback):
     def _predictions(
         self, trainer: Trainer, pl_module: Classifier, data: AdaptationData, round_: int
     ) -> TeacherPredictions:
-        """Of all training clouds of the target."""
+        """Predict all training clouds of the target."""
         teacher = pl_module.net
         if (weights := self._teacher(pl_module, round_)) is not None:
             teacher = pl_module.fresh_net(phase=0).to(pl_module.device)

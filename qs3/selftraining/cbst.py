@@ -2,7 +2,7 @@
 
 Zou et al., "Unsupervised Domain Adaptation for Semantic Segmentation via Class-Balanced
 Self-Training", ECCV 2018; Zou et al., "Confidence Regularized Self-Training", ICCV 2019. Both are
-about pixels; what is done here with clouds is said in the docstrings.
+about pixels; the docstrings describe what is done here with clouds.
 """
 
 import math
@@ -85,7 +85,7 @@ class Cbst:
             powers = np.exp(logs - top)
             total = powers.sum(axis=1, keepdims=True)
             soft = powers / total
-            # By the other terms alone, which are lost beside a largest of 1. A quotient of 1, as of
+            # By the other terms alone, which vanish next to a largest of 1. A quotient of 1, as of
             # the sample that sets a threshold, is enough: no softmax says 0 of the other classes.
             others = np.sort(powers, axis=1)[:, :-1].sum(axis=1)
             keep |= top[:, 0] + np.log1p(others) > 0

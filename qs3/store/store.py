@@ -239,7 +239,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     for 500 MB); the manifest's always is.
 
     Raises:
-        MissingDataError: there is no such folder, or it was not finished.
+        MissingDataError: the folder does not exist, or was not finished.
         DataError: a file is damaged or does not fit the others; names file and row.
     """
     folder = Path(folder)

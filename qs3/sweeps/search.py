@@ -103,7 +103,7 @@ class LabelFreeSearch(OverLauncher):
         """Launch open trials, then new ones, and tell the study, until it has as many as asked."""
         from optuna.trial import Trial, TrialState
 
-        # The lock says that nobody runs an open trial now.
+        # The lock says that no process runs an open trial now.
         again: list[Trial] = []
         for trial in study.get_trials(states=(TrialState.RUNNING,)):
             if trial.params.keys() == space.keys():

@@ -54,7 +54,7 @@ def train(cfg: DictConfig) -> RunMetrics:
 
 
 def objective_of(cfg: DictConfig, metrics: RunMetrics) -> float | None:
-    """What a search looks at, NaN for a run that has diverged; None if there is no search."""
+    """What a search looks at, NaN for a run that has diverged; None without a search."""
     if cfg.objective is None:
         return None
     value = metrics.validators[cfg.objective]

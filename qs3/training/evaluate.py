@@ -59,7 +59,7 @@ ADAPTERS: dict[str, Callable[..., None]] = {
     "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/index.md
     "tent": minimise_entropy,
 }
-"""Values of `evaluation.norms` (`qs3.training.run.Judging`), beside "trained"."""
+"""Values of `evaluation.norms` (`qs3.training.run.Judging`), besides "trained"."""
 
 
 class SavedNets:

@@ -89,7 +89,7 @@ def _build(run: Run, method: Method, loaded: Loaded, given: Result | None, began
     of_rounds = ReleasedRounds if run.scheme.released else SelfTraining
     rounds = of_rounds(folder, phases, run.scheme, loaded.evaluation.classes)
     student = StudentSelection(folder, phases, cfg.selection.student)
-    # Nobody else can use a warm-up of two versions.
+    # A warm-up of two versions serves no other run.
     sharing = None if changed(loaded.started) else cfg.paths.warmup_dir
     sha256 = warmup_sha256(cfg, loaded.started)
     shared = SharedWarmup(folder, sharing, sha256, run.seed, phases.warmup)

@@ -147,7 +147,7 @@ def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
 
 
 def shares_of_student(scheme: SelfTrainingConfig, labelled: Shares, last: RoundRecord) -> Shares:
-    """Of the last round's pseudo-labels; with as many of the source beside them, of both."""
+    """Class shares of the last round's pseudo-labels; with as many of the source, of both."""
     counts = list(last.selected.values())
     pseudo = shares_of(np.repeat(np.arange(len(counts)), counts), len(counts))
     return (pseudo + labelled) / 2 if scheme.use_source else pseudo
@@ -159,12 +159,12 @@ def prior_beside(
     learnt: Shares,
     probabilities: Callable[[], Float[np.ndarray, "n c"]],
 ) -> Prior | None:
-    """`evaluation.prior` beside these shares; None if there is none.
+    """`evaluation.prior` against these shares; None without one.
 
     `probabilities`: the net's, of the target's training clouds, for shares that are estimated.
 
     Raises:
-        ConfigError: it is no prior.
+        ConfigError: it is not a prior.
     """
     if settings.prior is None:
         return None

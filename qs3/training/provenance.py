@@ -82,12 +82,12 @@ def _weights(cfg: DictConfig) -> str:
 
 
 def _sha256_of(versions: Mapping[str, str]) -> str:
-    """Of the classifier; "" without one."""
+    """SHA-256 of the classifier; "" without one."""
     return versions.get("weights", "").rpartition(" ")[2]
 
 
 def versions() -> dict[str, str]:
-    """Of what decides a result besides settings and data."""
+    """Versions of what decides a result besides settings and data."""
     import lightning
     import numpy as np
     import torch

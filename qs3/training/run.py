@@ -97,7 +97,7 @@ class Run:
 
     @property
     def seed(self) -> int:
-        """Of the run."""
+        """The run's seed."""
         return int(self.cfg.seed)
 
     @property

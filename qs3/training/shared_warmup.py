@@ -96,7 +96,7 @@ class SharedWarmup(Checkpoint):
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
-        """Wait until nobody copies there, as far as there can be a lock: it needs a file."""
+        """Wait until no other run copies there, as far as a lock can say: it needs a file."""
         assert self.shared is not None
         with contextlib.ExitStack() as stack:
             if not self.shared.exists() or os.access(self.shared, os.W_OK):

@@ -1,6 +1,6 @@
 """Nets and methods: steps against the formulas of the layers as published, in one process.
 
-The figures of docs/reference/backbones.md and docs/how-to/leaderboard.md.
+The figures of docs/reference/backbones.md.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ class GreyNoise:
     read_noise_e: float
 
     def variance(self, mean: np.ndarray) -> np.ndarray:
-        """Of whole grey values, at mean grey values of any shape; rounding has 1/12 of it."""
+        """Noise of whole grey values, at mean grey values of any shape; rounding has 1/12 of it."""
         per_grey = self.electrons_at_white / 255.0
         return np.maximum(mean, 0) / per_grey + (self.read_noise_e / per_grey) ** 2 + 1 / 12
 
@@ -92,7 +92,7 @@ class InfraredCamera:
         return 1.0 if self.max_exposure is None else max(1.0, gain / self.max_exposure)
 
     def noise(self, gain: float) -> GreyNoise:
-        """Of pictures with `gain` grey values per unit of radiance, speckle aside."""
+        """Noise of pictures with `gain` grey values per unit of radiance, speckle aside."""
         return GreyNoise(self.electrons_at_white / self.amplified(gain), self.read_noise_e)
 
     def expose(
