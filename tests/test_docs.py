@@ -81,3 +81,10 @@ def test_the_readme_example_runs(capsys):
     (block,) = re.findall(r"```python\n(.*?)```", text_of("README.md"), re.DOTALL)
     exec(compile(block, "README.md", "exec"), {})
     assert capsys.readouterr().out.strip() in CLASSES
+
+
+def test_the_language_is_plain():
+    """Words that a well-edited textbook seldom uses; there were 1,100 of them."""
+    words = re.compile(r"\b(said|told|tells|beside|nobody|by lot|is no |are no )|\"\"\"Of ", re.I)
+    texts = [path.read_text("utf-8") for path in (*PAGES, *ROOT.glob("qs3/**/*.py"))]
+    assert sum(len(words.findall(text)) for text in texts) <= 110

@@ -162,7 +162,7 @@ class Plan:
 
     @property
     def catalogue_seed(self) -> int:
-        """Seed; of the other half of meshes, another catalogue: those of two seeds share no mesh."""
+        """Another one for the other half of meshes: catalogues of two seeds share no mesh."""
         other = _OTHER_HALF if self.options.half == "second" else 0
         return int(self.cfg.catalogue.seed) + other
 
