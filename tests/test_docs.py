@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 from qs3.classes import CLASSES
+from tests.composing import compose
 from tests.running import main
 
 ROOT = Path(__file__).parents[1]
@@ -88,3 +89,20 @@ def test_the_language_is_plain():
     words = re.compile(r"\b(said|told|tells|beside|nobody|by lot|is no |are no )|\"\"\"Of ", re.I)
     texts = [path.read_text("utf-8") for path in (*PAGES, *ROOT.glob("qs3/**/*.py"))]
     assert sum(len(words.findall(text)) for text in texts) <= 110
+
+
+def test_trainings_and_generations_of_the_documents_compose():
+    """But for those whose config the reader is about to write."""
+    lines = set()
+    for page in PAGES:
+        text = re.sub(r"\\\n\s*", "", page.read_text("utf-8"))
+        lines |= set(re.findall(r"(?:^ {4}|`)python ((?:train|generate)\.py [^`\n]+)", text, re.M))
+    own = re.compile(r"=(NAME|consistency|mean_net|margin)\b|^-|--cfg|--help")
+    kept = [shlex.split(re.split(r"  | #", line)[0]) for line in lines if not own.search(line)]
+    assert len(kept) > 50
+    for script, *words in kept:
+        words = [
+            w for w in words if not w.startswith(("hydra", "$", "-m")) and "interval(" not in w
+        ]
+        words = [re.sub(r"^((?:seed|[\w.]*theta)=[^,]+),.*", r"\1", word) for word in words]
+        compose(script.removesuffix(".py"), words)
