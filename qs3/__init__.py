@@ -13,15 +13,21 @@ from qs3.utils.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from qs3.api import generate, train
+    from qs3.generation.sense import match, sense
     from qs3.inference.predictor import load
 
-__all__ = ["__version__", "generate", "load", "train"]
+__all__ = ["__version__", "generate", "load", "match", "sense", "train"]
+
+_MODULES = {
+    "load": "qs3.inference.predictor",
+    "match": "qs3.generation.sense",
+    "sense": "qs3.generation.sense",
+}
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        module = "qs3.inference.predictor" if name == "load" else "qs3.api"
-        return getattr(import_module(module), name)
+        return getattr(import_module(_MODULES.get(name, "qs3.api")), name)
     raise AttributeError(f"module 'qs3' has no attribute {name!r}")
 
 

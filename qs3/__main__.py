@@ -33,6 +33,8 @@ COMMANDS: Commands = {
     "leaderboard": "qs3.commands.report:leaderboard",
     "bench": "qs3.commands.sensors:bench",
     "fit": "qs3.commands.sensors:fit",
+    "sense": "qs3.commands.sense:sense",
+    "match": "qs3.commands.sense:match",
 }
 
 

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import nbformat
@@ -122,3 +123,21 @@ def test_04_pyg():
     assert "the same bytes: True" in text
     assert "the same labels: True" in text
     assert printed(done, "stderr") == ""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is an extra")
+def test_05_sense():
+    done = run("05_sense", FOLDER)
+    assert len(images(done)) == 2
+    text = printed(done)
+    found = re.findall(r"(\w+) +measures +(\d+)%, half of it within (\d+\.\d) mm", text)
+    room, gripper = ({name: (int(share), float(mm)) for name, share, mm in part}
+                     for part in (found[:4], found[4:]))  # fmt: skip
+    assert len(room) == len(gripper) == 4
+    assert all(share > 60 and mm < 10 for share, mm in room.values())
+    assert gripper["kinect_v1"][0] < 40 < 80 < gripper["realsense_d435"][0]
+    assert "the same bytes: True" in text
+    noise = [float(mm) for mm in re.findall(r"noise (\d+\.\d) mm", text)]
+    assert 2.5 < noise[1] / noise[0] < 6  # as the square of the distance
+    assert all(float(r) > 0.8 for r in re.findall(r"correlate by (\d\.\d+)", text))

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.config.compose import composed
-from qs3.config.hydra import build
+from qs3.generation.sense import device
 from qs3.geometry.cameras import look_at
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.base import DepthSensor
@@ -25,8 +24,7 @@ _DEPTHS_M = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 
 def load(name: str, overrides: Sequence[str] = ()) -> Subject:
     """A sensor by the name of its file in conf/sensor ("kinect_v1"), and words of Hydra."""
-    cfg = composed(None, f"+sensor={name}", *overrides, place=f"sensor={name}: ")
-    return Subject(name, build(cfg.sensor))
+    return Subject(name, device(name, *overrides))
 
 
 @dataclass(frozen=True)

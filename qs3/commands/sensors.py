@@ -43,9 +43,6 @@ def fit(
     baseline: Annotated[
         float | None, "m from camera to projector, negative to the left: for the shadows"
     ] = None,
-    images: Annotated[Path | None, "a folder of infrared pictures, in place of frames"] = None,
-    base: Annotated[str, "stereo preset that images= begins with"] = "realsense_d415",
-    distance: Annotated[float | None, Gt(0), "m to the wall of the pictures"] = None,
 ) -> None:
     """Write a preset for your own depth camera, from images of a flat wall.
 
@@ -54,28 +51,14 @@ def fit(
     The law of the noise, the steps of 1/Z or of Z, the share of valid pixels and, with distances=,
     the bias are fitted; generation adds them to the true depth.
 
-    images=FOLDER holds pictures of a wall that faces an active stereo camera, with the projector
-    on: left.png, right.png, and the same with it off: left_off.png, right_off.png. Ambient light,
-    blur and read noise of base= are fitted to them.
-
     Example:
         qs3 fit frames/*.png intrinsics=580,580,319.5,239.5 out=conf/sensor/my_camera.yaml
-        qs3 fit images=pictures distance=1.2 out=conf/sensor/my_stereo.yaml
     """
-    from qs3.errors import ConfigError
+    from qs3.calibration.fit import fit_walls, plot_noise
     from qs3.utils.files import write_text
 
-    if images is not None:
-        from qs3.calibration.infrared import fit_pictures
-
-        if distance is None or out.stem == base:
-            raise ConfigError("images= takes distance=METRES, and another name for out= than base=")
-        text = fit_pictures(images, base, distance)
-    else:
-        from qs3.calibration.fit import fit_walls, plot_noise
-
-        files = [Path(frame) for frame in frames]
-        text, noise = fit_walls(files, intrinsics, focal, unit, distances, baseline)
-        plot_noise(noise, out.with_suffix(".png"))
+    files = [Path(frame) for frame in frames]
+    text, noise = fit_walls(files, intrinsics, focal, unit, distances, baseline)
+    plot_noise(noise, out.with_suffix(".png"))
     write_text(out, text)
     print(f"{text}\nwrote {out}")

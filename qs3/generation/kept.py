@@ -176,13 +176,19 @@ def view_images(frame: DepthFrame) -> list[tuple[str, Image]]:
             low, high = _range(values)
             title = f"{name}, {low:.2f} to {high:.2f} {unit}"
             found.append((title, value_image(values, low, high, colours)))
-    reasons = np.zeros((*frame.reason.shape, 3), dtype=np.uint8)
+    title, image = reason_image(frame.reason)
+    return [*found, (f"why there is a depth or none:\n{title}", image)]
+
+
+def reason_image(reason: np.ndarray) -> tuple[str, Image]:
+    """The shares of the reasons [h, w] in words, and the reasons in colours."""
+    image = np.zeros((*reason.shape, 3), dtype=np.uint8)
     shares = []
-    for reason, bgr in REASON_COLOURS.items():
-        reasons[frame.reason == reason] = bgr[::-1]
-        if share := float((frame.reason == reason).mean()):
-            shares.append(f"{reason.name.lower()} {share:.1%}")
-    return [*found, ("why there is a depth or none:\n" + "\n".join(shares), reasons)]
+    for one, bgr in REASON_COLOURS.items():
+        image[reason == one] = bgr[::-1]
+        if share := float((reason == one).mean()):
+            shares.append(f"{one.name.lower()} {share:.1%}")
+    return "\n".join(shares), image
 
 
 def view_picture(frame: DepthFrame) -> Figure:

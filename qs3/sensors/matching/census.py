@@ -13,7 +13,6 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 from annotated_types import Ge, Interval
-from numpy.lib.stride_tricks import as_strided, sliding_window_view
 
 from qs3.sensors.matching.base import (
     Match,
@@ -27,7 +26,7 @@ from qs3.sensors.optics.visibility import Reason, first_reason
 from qs3.utils.settings import IsOdd, NotNegative, settings
 
 
-def census(image: np.ndarray, window_px: int) -> list[np.ndarray]:
+def census(image: np.ndarray, window_px: int) -> np.ndarray:
     """Which pixels of the window around a pixel are brighter than it.
 
     Zabih and Woodfill, Non-parametric local transforms, ECCV 1994, section 3. The border is
@@ -38,95 +37,15 @@ def census(image: np.ndarray, window_px: int) -> list[np.ndarray]:
         window_px: side of the window, odd.
 
     Returns:
-        Arrays [h, w] of unsigned integers, as few and as narrow as hold window_px ** 2 - 1 bits.
+        [n, h, w] uint64, as few as hold window_px ** 2 - 1 bits.
     """
+    from qs3.sensors.matching.numba_kernels import census_bits
+
     half = window_px // 2
-    height, width = image.shape
     padded = cv2.copyMakeBorder(image, half, half, half, half, cv2.BORDER_REFLECT_101)
-    around = [divmod(k, window_px) for k in range(window_px**2)]
-    around.remove((half, half))
-    planes = np.zeros((-(-len(around) // 8), height, width), dtype=np.uint8)
-    for bit, (dy, dx) in enumerate(around):
-        brighter = padded[dy : dy + height, dx : dx + width] > image
-        planes[bit // 8] |= brighter.view(np.uint8) << np.uint8(bit % 8)
-    words = []
-    while len(planes):
-        size = min(8, 1 << (len(planes) - 1).bit_length())
-        word = np.zeros((height, width, size), dtype=np.uint8)
-        part = planes[:size]
-        word[..., : len(part)] = part.transpose(1, 2, 0)
-        words.append(word.view(f"u{size}")[..., 0])
-        planes = planes[size:]
+    words = np.zeros((-(-(window_px**2 - 1) // 64), *image.shape), dtype=np.uint64)
+    census_bits(padded, half, words)
     return words
-
-
-def count_ones(words: np.ndarray) -> np.ndarray:
-    """Number of set bits of unsigned integers, as uint8.
-
-    Neighbouring bits are added, then pairs, then fours, then all bytes by one multiplication
-    (Warren, Hacker's Delight, section 5-1): no table, and vectorised.
-    """
-    kind = words.dtype.type
-    bits = 8 * words.dtype.itemsize
-    full = (1 << bits) - 1
-    every_second, pairs, fours = (kind(full // d) for d in (3, 5, 17))
-    x = words - ((words >> kind(1)) & every_second)
-    y = (x >> kind(2)) & pairs
-    x &= pairs
-    x += y
-    np.right_shift(x, kind(4), out=y)
-    x += y
-    x &= fours
-    if bits > 8:
-        x *= kind(full // 255)
-        x >>= kind(bits - 8)
-    return x.astype(np.uint8)
-
-
-STRIP_ROWS = 64
-"""Rows that are turned at a time for the horizontal paths: some MB, which a cache holds."""
-
-
-def aggregate(cost: np.ndarray, small: int, large: int) -> np.ndarray:
-    """Sum of the path costs along rows and columns, both ways.
-
-    Args:
-        cost: [h, w, D] uint16; 4 * (largest cost + large) must be below 65536.
-        small: P1, for a step of one disparity between neighbours.
-        large: P2, for any larger step.
-
-    Returns:
-        [h, w, D] uint16.
-    """
-    total = np.zeros_like(cost)
-    both_ways = (slice(None), slice(None, None, -1))
-    for flip in both_ways:
-        _sweep(cost[flip], total[flip], small, large)
-    for top in range(0, len(cost), STRIP_ROWS):
-        rows = slice(top, top + STRIP_ROWS)
-        turned = np.ascontiguousarray(cost[rows].transpose(1, 0, 2))
-        total_turned = np.zeros_like(turned)
-        for flip in both_ways:
-            _sweep(turned[flip], total_turned[flip], small, large)
-        total[rows] += total_turned.transpose(1, 0, 2)
-    return total
-
-
-def _sweep(cost: np.ndarray, total: np.ndarray, small: int, large: int) -> None:
-    """Add to `total` the costs of paths from line to line; both are [lines, places, D] uint16."""
-    p1, p2 = np.uint16(small), np.uint16(large)
-    # Kept with its minimum at 0, so that min L_p drops out.
-    before = np.zeros(cost.shape[1:], dtype=np.uint16)
-    best = np.empty_like(before)
-    step = np.empty_like(before)
-    for i in range(len(cost)):
-        np.minimum(before, p2, out=best)
-        np.add(before, p1, out=step)
-        np.minimum(best[:, 1:], step[:, :-1], out=best[:, 1:])
-        np.minimum(best[:, :-1], step[:, 1:], out=best[:, :-1])
-        best += cost[i]
-        total[i] += best
-        np.subtract(best, best.min(axis=1, keepdims=True), out=before)
 
 
 @settings
@@ -185,6 +104,8 @@ class CensusMatcher:
 
     def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
         """Disparities; see `Matcher.match`."""
+        from qs3.sensors.matching import numba_kernels
+
         height, width = image.shape
         count = self.num_disparities
         # Place j of the volumes is disparity most - j: pixel u meets column begin + u + j.
@@ -193,15 +114,11 @@ class CensusMatcher:
         cost = self._cost(image, other, begin)
         total = self._aggregated(cost)
 
-        best = total.argmin(axis=2)
-        row_of_costs = np.arange(height * width).reshape(height, width) * count
-
-        def at(volume: np.ndarray, step: int) -> np.ndarray:
-            place = np.clip(best + step, 0, count - 1)
-            return volume.reshape(-1)[row_of_costs + place].astype(np.float32)
-
-        phase = offset(at(cost, -1), at(cost, 0), at(cost, 1))
-        disparity = most - best - linearised(phase, self.a_factor)
+        best = np.empty(image.shape, dtype=np.int32)
+        below, here, above, top, second = beside = np.empty((5, *image.shape), dtype=np.float32)
+        other_best = np.empty((height, width + count - 1), dtype=np.int32)
+        numba_kernels.cheapest(total, cost, best, beside, other_best)
+        disparity = most - best - linearised(offset(below, here, above), self.a_factor)
 
         columns = begin + np.arange(width) + best
         within = (columns >= 1) & (columns < other.shape[1] - 1)
@@ -212,13 +129,9 @@ class CensusMatcher:
         inner = (best > 0) & (best < count - 1)
         consistent = np.ones_like(inner)
         if self.max_difference_px >= 0:
-            back = np.take_along_axis(_best_of_other(total), np.arange(width) + best, axis=1)
+            back = np.take_along_axis(other_best, np.arange(width) + best, axis=1)
             consistent = np.abs(back - best) <= self.max_difference_px
-        top = at(total, 0)
-        for step in (-1, 0, 1):  # blank the winner and look again
-            place = np.clip(best + step, 0, count - 1)
-            total.reshape(-1)[row_of_costs + place] = np.iinfo(total.dtype).max
-        unique = total.min(axis=2) > top * np.float32(1 + self.uniqueness_percent / 100)
+        unique = second > top * np.float32(1 + self.uniqueness_percent / 100)
 
         valid = within & textured & inner & unique & consistent
         causes = {
@@ -232,56 +145,30 @@ class CensusMatcher:
 
     def _cost(self, image: np.ndarray, other: np.ndarray, begin: int) -> np.ndarray:
         """[h, w, D] uint16 cost summed over the block; place [v, u, j] is column begin + u + j."""
+        from qs3.sensors.matching import numba_kernels
+
         height, width = image.shape
         count = self.num_disparities
         length = width + count - 1
-        words = census(image, self.window_px)
-        others = [columns_of(word, begin, length) for word in census(other, self.window_px)]
+        words, others = census(image, self.window_px), census(other, self.window_px)
+        others = np.stack([columns_of(word, begin, length) for word in others])
         cost = np.empty((height, width, count), dtype=np.uint16)
-        for row in range(height):  # a row of all places fits a cache
-            bits = np.zeros((width, count), dtype=np.uint8)
-            for a, b in zip(words, others, strict=True):
-                bits += count_ones(a[row][:, None] ^ sliding_window_view(b[row], count))
-            cost[row] = bits
-        columns = np.arange(begin, begin + length)
-        missing = sliding_window_view((columns < 0) | (columns >= other.shape[1]), count)
-        if missing.any():
-            np.copyto(cost, np.uint16(self._worst), where=missing)
-        if self.block_px == 1:
-            return cost
-        size = (self.block_px, self.block_px)
-        border = cv2.BORDER_REFLECT_101
-        return cv2.boxFilter(cost, cv2.CV_16U, size, normalize=False, borderType=border)
+        ends = -begin, other.shape[1] - begin
+        half = self.block_px // 2
+        numba_kernels.block_costs(words, others, *ends, np.uint16(self._worst), half, cost)
+        return cost
 
     def _aggregated(self, cost: np.ndarray) -> np.ndarray:
-        """[h, w, D] uint16 that choose the disparity; never `cost` itself."""
+        """[h, w, D] uint16 that choose the disparity."""
+        from qs3.sensors.matching import numba_kernels
+
         if not self.paths:
-            return cost.copy()
+            return cost
         area = self.block_px**2
         # As many bits are dropped as the sum over all paths needs to fit 16.
         largest = int(self.paths * area * (self._worst + self.large_step))
         drop = max(0, largest.bit_length() - 16)
-        return aggregate(
-            cost >> np.uint16(drop) if drop else cost,
-            round(self.small_step * area) >> drop,
-            round(self.large_step * area) >> drop,
-        )
-
-
-def _best_of_other(total: np.ndarray) -> np.ndarray:
-    """[h, w + D - 1] place j of the lowest total[v, x - j, j] for each column x of the other image.
-
-    `total` is [h, w, D]; place [v, u, j] is column u + j of the other image.
-    """
-    height, width, count = total.shape
-    out = np.empty((height, width + count - 1), dtype=np.intp)
-    padded = np.full((width + 2 * (count - 1), count), np.iinfo(total.dtype).max, dtype=total.dtype)
-    row_bytes, place_bytes = padded.strides
-    # Element [x, j] of the diagonals is padded[count - 1 + x - j, j].
-    diagonals = as_strided(
-        padded[count - 1 :], (width + count - 1, count), (row_bytes, place_bytes - row_bytes)
-    )
-    for row in range(height):
-        padded[count - 1 : count - 1 + width] = total[row]
-        diagonals.argmin(axis=1, out=out[row])
-    return out
+        steps = (round(step * area) >> drop for step in (self.small_step, self.large_step))
+        total = np.empty_like(cost)
+        numba_kernels.path_sums(cost, np.uint16(drop), *map(np.uint16, steps), total)
+        return total

@@ -1,6 +1,5 @@
 """What devices do to a disparity map after matching: quantise it, and drop what looks wrong."""
 
-import itertools
 from typing import Annotated, Protocol, runtime_checkable
 
 import cv2
@@ -82,12 +81,11 @@ class SpatialFilter:
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""
-        out, alpha = np.array(disparity, dtype=np.float32), np.float32(self.alpha)
+        from qs3.sensors.matching.numba_kernels import smooth_lines
+
+        out = np.array(disparity, dtype=np.float32)
         for axis in (1, 0) * self.iterations:
-            lines = np.ascontiguousarray(np.moveaxis(out, axis, 0))
-            for before, here in (*itertools.pairwise(lines), *itertools.pairwise(lines[::-1])):
-                with np.errstate(invalid="ignore"):
-                    near = np.abs(here - before) <= self.max_step_px  # false for NaN
-                np.copyto(here, alpha * here + (1 - alpha) * before, where=near)
-            out = np.moveaxis(lines, 0, axis)
+            lines = np.array(np.moveaxis(out, axis, 0).T, order="C")
+            smooth_lines(lines, np.float32(self.alpha), np.float32(self.max_step_px))
+            out = np.moveaxis(lines.T, 0, axis)
         return np.ascontiguousarray(out)

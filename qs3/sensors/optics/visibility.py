@@ -85,6 +85,9 @@ def sample_centres(camera: Camera, renderer: Renderer, seed: int) -> np.ndarray:
     are rendered with one camera a call.
     """
     k, window = camera.intrinsics, camera.rendered
+    if getattr(renderer, "even", False):
+        columns = window.left + np.arange(window.width, dtype=np.float64)
+        return np.broadcast_to(columns, (window.height, window.width))
     ends_x = np.abs(np.array([window.left - 1, window.left + window.width]) - k.cx_px)
     ends_y = np.abs(np.array([window.top - 1, window.top + window.height]) - k.cy_px)
     room = 1.1  # the plane and the slide are larger than the view by this factor

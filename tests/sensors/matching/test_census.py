@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from qs3.sensors.matching import CensusMatcher
 from qs3.sensors.matching.base import offset
-from qs3.sensors.matching.census import _best_of_other, aggregate, census, count_ones
+from qs3.sensors.matching.census import census
+from qs3.sensors.matching.numba_kernels import cheapest, path_sums
 from qs3.sensors.optics.visibility import Reason
 from tests.sensors.matching.textures import dots, seen
 
@@ -28,7 +29,8 @@ def test_hamming_distances_equal_a_count_by_hand(window, dtype):
     rng = np.random.default_rng(window)
     a, b = (rng.integers(0, 9, (14, 15)).astype(dtype) for _ in range(2))
     words = zip(census(a, window), census(b, window), strict=True)
-    distance = sum(count_ones(x ^ y).astype(int) for x, y in words)
+    ones = np.vectorize(lambda word: int(word).bit_count())
+    distance = sum(ones(x ^ y) for x, y in words)
     for row, col in itertools.product(range(14), range(15)):
         by_hand = (brighter(a, window, row, col) != brighter(b, window, row, col)).sum()
         assert distance[row, col] == by_hand
@@ -76,21 +78,31 @@ def path_costs(cost, small, large, step):
     return np.array([[at(row, col) for col in range(width)] for row in range(height)])
 
 
-def test_path_sums_equal_a_recursion_by_hand(monkeypatch):
+def test_path_sums_equal_a_recursion_by_hand():
     cost = np.random.default_rng(4).integers(0, 90, (6, 7, 4)).astype(np.uint16)
     steps = [(0, 1), (0, -1), (1, 0), (-1, 0)]
-    by_hand = sum(path_costs(cost, 5, 31, step) for step in steps)
-    np.testing.assert_array_equal(aggregate(cost, 5, 31), by_hand)
-    monkeypatch.setattr("qs3.sensors.matching.census.STRIP_ROWS", 4)  # however rows are cut
-    np.testing.assert_array_equal(aggregate(cost, 5, 31), by_hand)
+    for drop in (0, 2):
+        by_hand = sum(path_costs(cost >> drop, 5, 31, step) for step in steps)
+        found = np.empty_like(cost)
+        path_sums(cost, *np.array([drop, 5, 31], np.uint16), found)
+        np.testing.assert_array_equal(found, by_hand)
 
 
-def test_the_best_place_of_the_other_image_is_read_along_the_diagonals():
-    total = np.random.default_rng(2).integers(0, 1000, (3, 7, 4)).astype(np.uint16)
-    best = _best_of_other(total)
+def test_the_best_places_of_both_images_and_what_decides_whether_they_count():
+    rng = np.random.default_rng(2)
+    total, cost = rng.integers(0, 30, (2, 3, 7, 4)).astype(np.uint16)
+    best, beside = np.empty((3, 7), np.int32), np.empty((5, 3, 7), np.float32)
+    back = np.empty((3, 10), np.int32)
+    cheapest(total, cost, best, beside, back)
+    np.testing.assert_array_equal(best, total.argmin(axis=2))
+    for row, u in itertools.product(range(3), range(7)):
+        here = best[row, u]
+        near = [cost[row, u, min(max(here + step, 0), 3)] for step in (-1, 0, 1)]
+        others = [total[row, u, j] for j in range(4) if abs(j - here) > 1] or [65535]
+        assert beside[:, row, u].tolist() == [*near, total[row, u, here], min(others)]
     for row, x in itertools.product(range(3), range(7 + 3)):
         costs = {j: total[row, x - j, j] for j in range(4) if 0 <= x - j < 7}
-        assert best[row, x] == min(costs, key=costs.get)
+        assert back[row, x] == min(costs, key=costs.get)
 
 
 @given(st.floats(-0.5, 0.5), st.floats(1, 90))
