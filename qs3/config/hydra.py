@@ -46,7 +46,7 @@ _UNHASHED = (
     "trainer.cuda_graphs",  # the same kernels, started at once
     "data.cache_dir",
     "data.make_source",
-    *("method.file", "model.file"),  # their content matters, wherever they lie: .sha256
+    "method.file",  # its content matters, wherever it lies: .sha256
     *(
         f"data.{domain}.{key}"
         for domain in ("source", "target")
@@ -202,12 +202,11 @@ def config_sha256(cfg: DictConfig) -> str:
     Interpolations are hashed as they are written: what they point to is hashed at its own place,
     or does not matter. But by its value is hashed what comes from outside of the config
     (`${oc.env:NAME}`), or from a `selftraining` without rounds, which is not hashed itself; and a
-    method's or a model's file by its content.
+    method's file by its content.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
-    for group in ("method", "model"):
-        if "sha256" in (plain.get(group) or {}):
-            plain[group]["sha256"] = cfg[group].sha256
+    if "sha256" in (plain.get("method") or {}):
+        plain["method"]["sha256"] = cfg.method.sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
     plain.setdefault("callbacks", {})  # ~callbacks leaves nothing out

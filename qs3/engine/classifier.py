@@ -128,13 +128,8 @@ class Classifier(LightningModule):
         self._loaded_plateau = checkpoint.get("plateau")
 
     def on_train_start(self) -> None:
-        """Make graphs where passes are on one GPU; a frozen backbone's go through the host."""
-        if (
-            self.cuda_graphs
-            and self._is_on_one_gpu()
-            and isinstance(self.net, PointClassifier)
-            and any(p.requires_grad for p in self.net.backbone.parameters())
-        ):
+        """Make graphs where passes are on one GPU."""
+        if self.cuda_graphs and self._is_on_one_gpu() and isinstance(self.net, PointClassifier):
             self._graphs = Graphs(self.net)
 
     def _is_on_one_gpu(self) -> bool:

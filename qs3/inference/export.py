@@ -50,7 +50,6 @@ ALLOWED = 1e-4  # difference of logits
 INPUT, OUTPUT = "points", "logits"
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
 _PRIVATE = ("paths.", "hydra.")  # overrides that no other machine needs
-_FEATURES = "qs3.models.features.features"  # a head on a file that has no place in a folder
 
 
 def compared(theirs: Float[np.ndarray, "n c"], ours: Float[np.ndarray, "n c"]) -> tuple[bool, str]:
@@ -95,8 +94,6 @@ def export_folder(
         packages: where the net may be defined; the code there is run.
     """
     file, result = find_result(ckpt), read_result(ckpt)
-    if result.model["_target_"] == _FEATURES:
-        raise ConfigError("model=features cannot be a folder: its backbone's file is not in it")
     others = not (folder / WEIGHTS).exists() and any((folder / x).exists() for x in (CARD, CONFIG))
     if others or file.parent.resolve() == folder.resolve():
         raise ConfigError(f"out={folder} holds something else; give another folder")

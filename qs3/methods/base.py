@@ -109,20 +109,6 @@ def feature_dims(net: Any) -> tuple[int, int | None]:
     return features.global_.shape[1], None if per_point is None else per_point.shape[2]
 
 
-def check_taught(net: Any, key: str) -> None:
-    """Refuse a loss of features that no gradient changes, such as those of `model=features`.
-
-    It would be minimised by nothing, and the run would be one without it under another name.
-
-    Raises:
-        ConfigError: they do not change; names `key`, which asks for the loss.
-    """
-    with torch.enable_grad():
-        taught = _of_two_clouds(net).global_.requires_grad
-    if not taught:
-        raise ConfigError(f"{key} trains a net's features, and this model's are frozen")
-
-
 def _of_two_clouds(net: Any) -> Features:
     """Features of two clouds in eval mode; nothing in the net changes."""
     parameter = next(net.parameters())

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Batch, Method, Terms, Weight, check_taught, class_loss, feature_dims
+from qs3.methods.base import Batch, Method, Terms, Weight, class_loss, feature_dims
 from qs3.models.base import ClassHead
 from qs3.utils.settings import checked
 
@@ -78,8 +78,6 @@ class Dann(Method):
 
     def prepare(self, net: nn.Module) -> None:
         """The domain head."""
-        if self.domain_weight:
-            check_taught(net, "method=dann")
         self.domain_head = ClassHead(feature_dims(net)[0], 2, dropout=0.0)
 
     def loss(self, net: Any, batch: Batch, generator: torch.Generator) -> Terms:

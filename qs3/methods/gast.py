@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Batch, Method, Terms, Weight, check_taught, feature_dims
+from qs3.methods.base import Batch, Method, Terms, Weight, feature_dims
 from qs3.methods.defrec import VOXELS, cloud_size, deform
 from qs3.methods.pcm import join, source_loss
 from qs3.utils.settings import checked
@@ -64,8 +64,6 @@ class Gast(Method):
 
     def prepare(self, net: nn.Module) -> None:
         """Linear heads: 27 voxels; four turns, twice. Only those of losses in use."""
-        if self.def_weight or self.rot_weight:
-            check_taught(net, "method=gast")
         width, _ = feature_dims(net)
         if self.def_weight:
             self.def_head = nn.Linear(width, VOXELS)

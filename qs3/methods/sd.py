@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Batch, Method, Terms, Weight, check_taught, class_loss
+from qs3.methods.base import Batch, Method, Terms, Weight, class_loss
 from qs3.utils.settings import Share, checked
 
 
@@ -85,8 +85,6 @@ class Sd(Method):
 
     def prepare(self, net: Any) -> None:
         """The teacher, which is the student before its first step."""
-        if self.consistency_weight:
-            check_taught(net, "method=sd")
         self.teacher = copy.deepcopy(net).requires_grad_(False)
 
     @torch.no_grad()

@@ -269,8 +269,6 @@ def _write(
     """What is reported, with all that using it elsewhere takes, and what it predicts."""
     cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
     model: Any = OmegaConf.to_container(cfg.model, resolve=True)
-    if "sha256" in model:  # of a file, as of model=features: whoever loads it may stand elsewhere
-        model["file"] = str(Path(model["file"]).expanduser().absolute())
     known = None
     if cfg.evaluation.norms == TRAINED:
         known = held_out(nets.of("validation", file), data.validation.labels.numpy())

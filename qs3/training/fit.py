@@ -7,7 +7,6 @@ import sys
 import time
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,7 +24,6 @@ from qs3.errors import ConfigError
 from qs3.inference.model_file import Result
 from qs3.kernels.norms import DomainNorm, check_has_norms
 from qs3.methods.base import Method, feature_dims
-from qs3.models.features import remember
 from qs3.runs.checkpoints import LAST, copy_weights, save
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.released import ReleasedRounds
@@ -165,9 +163,6 @@ def _build_each(group: DictConfig | None) -> list[Any]:
 
 def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     """One `Trainer.fit` over all phases; what comes after it reads saved weights alone."""
-    data, kept = loaded.data, run.cfg.data.cache_dir
-    clouds = (data.all_labelled, data.target, loaded.evaluation.test)
-    remember(built.classifier.net, clouds, Path(kept) if kept else None)
     if not run.cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
         built.shared_warmup.take()
     last = run.folder / LAST

@@ -14,8 +14,7 @@ from qs3.errors import DataError
 from qs3.models.base import PointClassifier, check_points
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
-FROZEN = {"features"}  # a file's net and a head: see test_features
-NETS = sorted({path.stem for path in CONF.glob("*.yaml")} - FROZEN)
+NETS = sorted(path.stem for path in CONF.glob("*.yaml"))
 UNDROPPED = {"pointdan", "committee"}  # no setting of theirs
 LARGE = {"pointnet2", "rscnn", "simpleview"}
 EACH = [pytest.param(n, marks=pytest.mark.slow if n in LARGE else ()) for n in NETS]
