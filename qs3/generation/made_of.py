@@ -15,7 +15,7 @@ from qs3.config.compose import choices, composed
 from qs3.generation.plan import Plan, recipe_fingerprint
 from qs3.store.meta import OK, MadeOf, ManifestRow
 
-_MATERIALS = {"mixed": "mixed materials", "principled": "principled materials"}
+_MATERIALS = {"principled": "principled materials"}
 _LIGHTS = {"area": "light above"}
 
 

@@ -18,7 +18,7 @@ from pydantic import InstanceOf
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
 from qs3.generation.kept import Keep, provenance_of
-from qs3.generation.materials import LightAbove, MixedMaterials
+from qs3.generation.materials import LightAbove, Principled
 from qs3.generation.released import PoseTable, ReleasedPlacing, ReleasedViews, box_of_corners
 from qs3.generation.scenes import Alone, Surroundings
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
@@ -160,7 +160,7 @@ class Mesh2Point:
     clean: bool = True
     min_clean_points: Least | None = None
     poses: InstanceOf[PoseTable] | None = None
-    materials: InstanceOf[MixedMaterials] | None = None
+    materials: Principled | None = None
     light: LightAbove | None = None
     box_of_corners: bool = False
     needs_renderer: bool = True
@@ -183,7 +183,7 @@ class Mesh2Point:
         true_poses = self.views.poses(pose_rng, box, object_id)
         bodies = self.scene.bodies(placed, np.stack(true_poses)[:, :3, 3], rng)
         if self.materials is not None:
-            bodies = self.materials.dress(bodies, object_rng(seed, object_id, 0, 1))
+            bodies = self.materials.dress(bodies)
         lighting = None if self.light is None else self.light.over(box)
         believed_poses = self.drift.believed(true_poses, pose_rng)
 

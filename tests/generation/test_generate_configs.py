@@ -216,11 +216,14 @@ def test_scans_that_would_share_a_name_are_refused(tmp_path):
         (["domain=specklenet10", "views=0"], "count"),
         (["domain=modelnet10", "+sensor=kinect_v1"], "no use"),
         (["domain=modelnet10", "keep_views=true"], "no use"),
-        *((["domain=blensor10", word], "no use") for word in ("materials=mixed", "light=area")),
+        *(
+            (["domain=blensor10", word], "no use")
+            for word in ("materials=principled", "light=area")
+        ),
         (["domain=kinectsim10", "poses=a.tar.gz"], "no use for poses"),
         (["domain=rooms10", "provenance=true"], "no use for provenance"),
         (["domain=modelnet10_dropout", "recipe.dropout.max_share=0.9"], "dropout"),
-        (["materials=mixed", "materials.kinds.wood.albedo=[0.4,1.2]"], "wood.albedo"),
+        (["materials=principled", "materials.albedo=1.2"], "albedo"),
     ],
 )
 def test_wrong_settings_name_their_key(words, key):
