@@ -132,18 +132,15 @@ def _difference(name: str, cells: Sequence[Cell], seeds: Sequence[int]) -> Compa
 def text(found: Sequence[Compared], base: str = "", table: Table | None = None) -> str:
     """A line a row of `against` (with its `base`) or of `effects`: differences in points of %.
 
-    And how many seeds would tell them apart; of `table` the title and its marks come first.
+    Of `table` the title and its marks come first.
     """
     tiers = any(len(one.subsets) > 1 for one in found)
     header = [f"minus {base}" if base else "difference", *["clouds"] * tiers]
-    rows = [[*header, "accuracy", "balanced accuracy", "seeds", "to tell apart"]]
+    rows = [[*header, "accuracy", "balanced accuracy", "seeds"]]
     for one in found:
         for subset, pair in one.subsets.items():
             shown = [f"{d.percent('+')}{' *' * d.clear}" for d in pair]
-            needed = f"{pair[0].seeds_needed} seeds"
-            needed = f"more {one.clusters}" if pair[0].seeds_needed is None else needed
-            needed = "-" if pair[0].clear else needed
-            rows.append([one.name, *[subset] * tiers, *shown, str(pair[0].seeds), needed])
+            rows.append([one.name, *[subset] * tiers, *shown, str(pair[0].seeds)])
     known = [one for one in found if one.subsets]
     clusters = " or ".join(dict.fromkeys(one.clusters for one in known)) or MESHES
     counts = sorted({next(iter(one.subsets.values()))[0].clusters for one in known})

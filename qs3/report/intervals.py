@@ -21,14 +21,12 @@ the interval is then too narrow.
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import t as student_t
 
 LEVEL = 0.95
-_SEEDS = np.arange(2, 1001)
 
 
 @dataclass(frozen=True)
@@ -36,8 +34,7 @@ class Interval:
     """A share in [0, 1], or a difference of two in [-1, 1].
 
     `mean` is over seeds, `sem` its standard error (None for one). `low` and `high` are the ends at
-    `LEVEL`, over clusters alone for one seed; None with a single cluster. `seeds_needed`: so many
-    would make 0 fall outside, if the mean stays as it is; None if no number of seeds would.
+    `LEVEL`, over clusters alone for one seed; None with a single cluster.
     """
 
     mean: float
@@ -46,7 +43,6 @@ class Interval:
     high: float | None
     seeds: int
     clusters: int
-    seeds_needed: int | None = None
 
     @property
     def clear(self) -> bool:
@@ -129,13 +125,8 @@ def _interval(
     if m < 2:
         return Interval(mean, sem, None, None, seeds, m)
     of_seeds, of_clusters = _variances(errors, weight, cluster)
-    fixed = float(_t2(m)) * of_clusters
-    half = math.sqrt(fixed + (float(_t2(seeds)) * of_seeds if seeds > 1 else 0.0))
-    # with other numbers of seeds, each of which varies as these do
-    halves = np.sqrt(_T2_OF_SEEDS * of_seeds * seeds / _SEEDS + fixed)
-    enough = _SEEDS[halves < abs(mean)]
-    needed = int(enough[0]) if len(enough) else None
-    return Interval(mean, sem, max(least, mean - half), min(1.0, mean + half), seeds, m, needed)
+    half = math.sqrt(_t2(m) * of_clusters + (_t2(seeds) * of_seeds if seeds > 1 else 0.0))
+    return Interval(mean, sem, max(least, mean - half), min(1.0, mean + half), seeds, m)
 
 
 def _variances(
@@ -163,9 +154,6 @@ def _variance(sums: Float[np.ndarray, " c"]) -> float:
     return float((sums**2).sum()) * len(sums) / (len(sums) - 1)
 
 
-def _t2(clusters: Any) -> Any:
+def _t2(clusters: int) -> float:
     """Square of Student's quantile at `LEVEL` for the mean of so many clusters, two or more."""
-    return student_t.ppf(0.5 + LEVEL / 2, clusters - 1) ** 2
-
-
-_T2_OF_SEEDS = _t2(_SEEDS)
+    return float(student_t.ppf(0.5 + LEVEL / 2, clusters - 1) ** 2)

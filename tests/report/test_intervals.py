@@ -91,7 +91,7 @@ def test_intervals_of_shares_hold_the_truth_and_rooms_widen_them(balanced):
 
 @pytest.mark.parametrize("seeds", [2, 4, 12])
 def test_what_no_way_has_of_its_own_is_taken_off(seeds):
-    """On average V_clusters is b's variance whatever the seeds, which `seeds_needed` relies on."""
+    """On average V_clusters is b's variance whatever the seeds."""
     rng, found = np.random.default_rng(7), []
     for _ in range(1000):
         a, b, left = (rng.normal(size=size) for size in ((seeds, 1), (1, 30), (seeds, 30)))
@@ -108,13 +108,3 @@ def test_scans_of_a_mesh_are_not_counted_as_independent():
     one = difference(d, np.zeros(20, int), np.arange(20))
     ten = difference(np.repeat(d, 10, axis=1), np.zeros(200, int), np.repeat(np.arange(20), 10))
     np.testing.assert_allclose([ten.low, ten.high], [one.low, one.high])
-
-
-def test_seeds_needed_are_enough():
-    rng = np.random.default_rng(3)
-    found = drawn(rng, 3, 200, 1, 0.15, 0.1)
-    assert not found.clear
-    assert found.seeds_needed > 3
-    many = [drawn(rng, 4 * found.seeds_needed, 200, 1, 0.15, 0.1).clear for _ in range(20)]
-    assert np.mean(many) > 0.8
-    assert drawn(rng, 3, 6, 1, 0.0, 2.0).seeds_needed is None  # too few meshes
