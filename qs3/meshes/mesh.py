@@ -68,12 +68,6 @@ class Mesh:
             return replace(whole, colliders=count)
         return cls(*without_strays(np.array(solid.vertices), np.array(solid.faces)))
 
-    def to_trimesh(self) -> trimesh.Trimesh:
-        """The same triangles in the same order, unprocessed, in arrays of their own."""
-        import trimesh
-
-        return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
-
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] lowest and highest corner over the vertices that faces use."""

@@ -160,14 +160,6 @@ class Quality:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
-class TrainingAccuracy:
-    """The share that is right of the n clouds trained on, with `data.clouds_a_class`."""
-
-    n: int
-    accuracy: float
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class DataHashes:
     """`PointSet.sha256` of both datasets; the source's is the target's for `method=supervised`."""
 
@@ -202,7 +194,6 @@ class RunMetrics:
         simulated: whether the target is.
         final: the reported scores: the student's, without rounds the warm-up's.
         validators: label-free scores by name.
-        training: with `data.clouds_a_class` alone.
         versions: of the software that began the run.
     """
 
@@ -226,7 +217,6 @@ class RunMetrics:
     student: StudentChoice | None = None
     validators: dict[str, float | None]
     quality: Quality
-    training: TrainingAccuracy | None = None
     data: DataHashes
     made_of: DataMadeOf
     times: Times

@@ -31,7 +31,6 @@ from qs3.runs.metrics import (
     RunMetrics,
     Selection,
     StudentChoice,
-    TrainingAccuracy,
     Warmup,
 )
 from qs3.runs.predictions import FILE as PREDICTIONS
@@ -74,7 +73,6 @@ class SavedNets:
         self.clouds = {
             "test": loaded.evaluation.test,
             "target": loaded.data.target,  # the training clouds
-            "labelled": loaded.data.labelled.clouds,
             "validation": loaded.data.validation.clouds,
         }
         self.classifier = built.classifier
@@ -103,7 +101,7 @@ class SavedNets:
         `norms`: of clouds of the target others than `evaluation.norms`.
         """
         norms, domain = norms or self.run.cfg.evaluation.norms, "target"
-        if which in ("validation", "labelled") and self.data.owner == "source":
+        if which == "validation" and self.data.owner == "source":
             norms, domain = TRAINED, "source"
         key = self._weights_in(file), which, norms
         if key not in self._predicted:
@@ -145,11 +143,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
 
     scores = {name: evaluation.scores_of(reported(path)) for name, path in files.items()}
     predictions = evaluation.predictions_of(reported(file))
-    prior, parts, student, training = prior_of(file), component_names(cfg), None, None
-    if cfg.data.clouds_a_class is not None:
-        hits = nets.of("labelled", file).argmax(axis=1) == data.labelled.labels.numpy()
-        log.info("%.1f %% of the %d training clouds are right", 100 * hits.mean(), len(hits))
-        training = TrainingAccuracy(n=len(hits), accuracy=float(hits.mean()))
+    prior, parts, student = prior_of(file), component_names(cfg), None
     if choice is not None:
         of_last = EpochScores(epoch=run.phases.total - 1, scores=scores["student"])
         student = StudentChoice(**choice.record(), last=of_last)
@@ -196,7 +190,6 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         student=student,
         validators=without_labels(nets.of("target", file), choice),
         quality=_quality(run, loaded, nets, file),
-        training=training,
         data=DataHashes(**loaded.started["data"]),
         made_of=loaded.made_of,
         times=built.clock.taken(),

@@ -11,6 +11,7 @@ from qs3.meshes.mesh import Mesh, merge
 from qs3.sensors.renderers.base import Body, Scene
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.generation.generating import QUICK
+from tests.meshes.written import as_trimesh
 
 LIT = ("materials=principled", "light=area")
 
@@ -46,12 +47,12 @@ def test_white_under_the_light_has_its_strength(side):
 
 def test_an_object_s_bytes_depend_on_its_id_and_not_on_the_others():
     words = ("domain=specklenet10", *QUICK, "views=1", *LIT)
-    both = qs3.generate({"a": stool().to_trimesh(), "b": stool().to_trimesh()}, *words)
-    alone = qs3.generate({"b": stool().to_trimesh()}, *words)["b"]
+    both = qs3.generate({"a": as_trimesh(stool()), "b": as_trimesh(stool())}, *words)
+    alone = qs3.generate({"b": as_trimesh(stool())}, *words)["b"]
     np.testing.assert_array_equal(alone.points, both["b"].points)
     np.testing.assert_array_equal(
         alone.frames[0].images["left"], both["b"].frames[0].images["left"]
     )
-    matt = qs3.generate({"b": stool().to_trimesh()}, *words[:-2])["b"]
+    matt = qs3.generate({"b": as_trimesh(stool())}, *words[:-2])["b"]
     np.testing.assert_array_equal(matt.clean, alone.clean)  # it stands where it stood
     assert (matt.frames[0].images["left"] != alone.frames[0].images["left"]).mean() > 0.05

@@ -24,6 +24,7 @@ from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.base import Body, Scene
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.generation.generating import composed as config
+from tests.meshes.written import as_trimesh
 
 RELEASED = Path(__file__).parents[4] / "shared/data/qs3_release/pose_params.tar.gz"
 needs_release = pytest.mark.skipif(
@@ -167,7 +168,7 @@ def test_generate_follows_the_poses_and_records_what_has_none(poses, tmp_path):
     meshes.mkdir(parents=True)
     (tmp_path / "meshes/sofa/train").mkdir()
     for name in ("test/sofa_0763", "test/sofa_0001", "train/sofa_0002"):
-        sofa().to_trimesh().export(meshes.parent / f"{name}.off", digits=9)
+        as_trimesh(sofa()).export(meshes.parent / f"{name}.off", digits=9)
     overrides = [
         *("domain=specklenet10", f"meshes={tmp_path / 'meshes'}", "classes=[sofa]"),
         *(f"poses={poses}", "renderer.samples=1", "views=1", "workers=0"),

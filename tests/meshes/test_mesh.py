@@ -6,13 +6,13 @@ import trimesh
 
 from qs3.errors import MeshError
 from qs3.meshes.mesh import Mesh
-from tests.meshes.written import PYRAMID, corners
+from tests.meshes.written import PYRAMID, as_trimesh, corners
 
 
 def test_there_and_back_nothing_changes():
     mesh = Mesh(PYRAMID.vertices, [*PYRAMID.faces[::-1], [0, 0, 1]])
     largest = mesh.vertices.max()
-    solid = mesh.to_trimesh()
+    solid = as_trimesh(mesh)
     assert isinstance(solid, trimesh.Trimesh)
     assert Mesh.from_trimesh(solid).sha256 == mesh.sha256
     solid.apply_scale(2)  # its own arrays

@@ -139,3 +139,8 @@ def threemf(items=PLATE, resources=RESOURCES, unit='unit="meter"', name="3D/3dmo
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr(name, text)
     return file.getvalue()
+
+
+def as_trimesh(mesh):
+    """The same triangles in the same order, unprocessed."""
+    return trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False)
