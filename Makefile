@@ -34,7 +34,7 @@ $(VENV)/installed: pyproject.toml $(PINS)
 doctor: install ## what works here, and which system package would help
 	@$(RUN) -m qs3 doctor
 
-quickstart: install ## the main job on embedded data, about seven minutes on 2 idle cores
+quickstart: install ## the main job on embedded data, about six minutes on 2 idle cores
 	@$(RUN) -m qs3 quickstart out=$(OUT)
 
 lint: install ## style, types and who may import whom; changes nothing

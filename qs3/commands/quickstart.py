@@ -46,7 +46,7 @@ def steps(out: str) -> list[str]:
 
 
 def quickstart(*, out: Annotated[Path, "where it all goes"] = Path("out/quickstart")) -> int:
-    """Run the main job on embedded data, about seven minutes on 2 idle cores.
+    """Run the main job on embedded data, about six minutes on 2 idle cores.
 
     Prints every command that it runs. A step that an earlier call finished is skipped.
     """
