@@ -18,16 +18,12 @@ if TYPE_CHECKING:
 
 __all__ = ["__version__", "generate", "load", "match", "sense", "train"]
 
-_MODULES = {
-    "load": "qs3.inference.predictor",
-    "match": "qs3.generation.sense",
-    "sense": "qs3.generation.sense",
-}
+_PLACES = {"generate": "api", "train": "api", "load": "inference.predictor"}
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        return getattr(import_module(_MODULES.get(name, "qs3.api")), name)
+        return getattr(import_module(f"qs3.{_PLACES.get(name, 'generation.sense')}"), name)
     raise AttributeError(f"module 'qs3' has no attribute {name!r}")
 
 

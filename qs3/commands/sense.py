@@ -43,12 +43,10 @@ def sense(
 
     def one(place: int, path: Path, target: Path) -> None:
         depth, grey = read_depth(path, depth_scale, camera.depth_scale), _albedo(albedo, path)
+        how: Any = {"albedo": grey, "ambient": ambient, "seed": (seed, place), "explain": True}
         found: dict[str, Any] = {}
         for name, model in devices.items():
-            how: Any = {"sensor": model, "albedo": grey, "ambient": ambient, "seed": (seed, place)}
-            why = explain or (picture is not None and place == 0)
-            made = functions.sense(depth, camera.camera, explain=why, **how)
-            found[name] = made if why else (made, None)
+            found[name] = functions.sense(depth, camera.camera, sensor=model, **how)
             own = target.with_stem(target.stem + f"_{name}" * (len(devices) > 1))
             _write(own, *found[name], explain=explain)
         if picture and place == 0:
@@ -79,10 +77,9 @@ def match(
     camera = read_intrinsics(intrinsics).camera
 
     def one(place: int, path: Path, target: Path) -> None:
-        pair = path, right / path.relative_to(left) if left.is_dir() else right
+        pair = _grey(path), _grey(right / path.relative_to(left) if left.is_dir() else right)
         how: Any = {"baseline_m": baseline, "preset": preset, "num_disparities": num_disparities}
-        made = functions.match(_grey(pair[0]), _grey(pair[1]), camera, explain=True, **how)
-        _write(target, *made, explain=explain)
+        _write(target, *functions.match(*pair, camera, explain=True, **how), explain=explain)
 
     _all(one, left, out)
 
@@ -152,11 +149,9 @@ def _draw(depth: Any, found: dict[str, Any], path: Path) -> None:
     from qs3.generation.kept import reason_image
     from qs3.utils.pictures import save_png, sheet, value_image
 
-    true = np.where(depth > 0, depth, np.nan)
-    low, high = np.nanpercentile(true, [1, 99])
-    depths = [true, *(noisy for noisy, _ in found.values())]
-    titles = [f"perfect depth, {low:.2f} to {high:.2f} m", *found]
+    depths = [np.where(depth > 0, depth, np.nan), *(noisy for noisy, _ in found.values())]
+    low, high = np.nanpercentile(depths[0], [1, 99])
     whys, reasons = zip(*(reason_image(why) for _, why in found.values()), strict=True)
     images = [value_image(values, low, high, "viridis") for values in depths]
-    words = [*titles, "", *whys]
+    words = [f"perfect depth, {low:.2f} to {high:.2f} m", *found, "", *whys]
     save_png(sheet([*images, None, *reasons], words, columns=len(depths), panel_in=2.5), path, 64)

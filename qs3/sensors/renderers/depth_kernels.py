@@ -112,15 +112,10 @@ def shade(
     high = max(samples - 1, 1)
     line = np.empty(width, dtype=np.float32)
     near, source = np.empty(count, dtype=np.float32), np.empty(count, dtype=np.int32)
-    tangents = (fx, cx)
     lit_rows, lit_columns = slide.shape
     dark = lit_rows == 0
     # What lies beside the camera's window casts shadows into it: the farther, the nearer it is.
-    most = np.float32(0)
-    for row in range(height):
-        for i in range(width):
-            most = max(most, w[row, i])
-    spare = 0 if dark else min(int(abs(lamp) * most / pitch) + 2, 2 * count)
+    spare = 0 if dark else min(int(abs(lamp) * w.max() / pitch) + 2, 2 * count)
     lamp_near = np.empty(0 if dark else count + 2 * spare, dtype=np.float32)
     lamp_source = np.empty(len(lamp_near), dtype=np.int32)
     stripe = np.zeros(lit_columns + 2, dtype=np.float32)
@@ -141,11 +136,11 @@ def shade(
             for i in range(width):
                 line[i] = w[r, i] + slope_y[r, i] * np.float32(v - r) if w[r, i] > 0 else 0
             here_on = (line, linked[r], slope_x[r])
-            _look(here_on, tangents, moved, start, pitch, True, (near, source))
+            _look(here_on, (fx, cx), moved, start, pitch, True, (near, source))
             place = y * scale + lit_rows / 2
             thrown = not dark and 0 <= place <= lit_rows
             if thrown:
-                _look(here_on, tangents, lamp, lamp_start, pitch, False, (lamp_near, lamp_source))
+                _look(here_on, (fx, cx), lamp, lamp_start, pitch, False, (lamp_near, lamp_source))
                 place = min(max(place - 0.5, 0), lit_rows - 1)
                 upper = min(int(place), lit_rows - 2) if lit_rows > 1 else 0
                 part, lower = np.float32(place - upper), min(upper + 1, lit_rows - 1)
