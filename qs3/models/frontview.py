@@ -1,9 +1,9 @@
 """A small image net on one picture of a cloud, from where its camera stood.
 
-Single depth views are pictures: neighbours in the picture say more than neighbours in
-space. Clouds lie as `data.scale=seen` puts them: the camera looks along +y, z is up. The picture is
-orthographic, as wide and high as the cloud, and the head also gets the cloud's sizes and
-heights. 767,930 parameters for 10 classes. (Ours.)
+Single depth views are pictures: neighbours in the picture say more than neighbours in space. Clouds
+lie as `data.scale=seen` puts them: the camera looks along +y, z is up. The picture is orthographic,
+as wide and high as the cloud, and the head also gets the cloud's sizes and heights. 767,930
+parameters for 10 classes. (Ours.)
 """
 
 from typing import Annotated
