@@ -111,7 +111,7 @@ class SelfTrainingConfig:
         weight_step: by how much the weight of both losses falls each epoch of the rounds, from 1
             (GAST's code: 0.005; both fall alike, so only its relation to the weight decay matters).
         released: the rounds of QS3's released code, see `qs3.selftraining.released`.
-        mrkld: weight of CRST's regulariser (see `qs3.selftraining.student_selection`); 0 is none.
+        mrkld: weight of CRST's regulariser (see `qs3.selftraining.student`); 0 is none.
         rehearsal: train on all target samples, whatever the selector keeps (`debug=fast`).
 
     Raises:

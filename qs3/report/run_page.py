@@ -229,14 +229,11 @@ def _curves(run: RunFiles, history: pd.DataFrame) -> Figure:
         axes[0].text(of.mean() + 1, 1.02, "warm-up" if phase == 0 else phase - 1, ha="center",
                      transform=axes[0].get_xaxis_transform(), fontsize=8.5,
                      color=SOFT)  # fmt: skip
-    marked = {}  # epochs from 0; -1 where there is none
-    if m := run.metrics:
-        marked = {"teacher": m.warmup.selected.epoch}
-        marked |= {"student": m.student.epoch} if m.student else {}
-    for (name, epoch), colour in zip(marked.items(), (RED, GREEN), strict=False):
-        for ax in axes if epoch >= 0 else ():
-            ax.axvline(epoch + 1, color=colour, linestyle="--", linewidth=1.1,
-                       label=f"{name}: epoch {epoch + 1}")  # fmt: skip
+    # Epochs from 0; -1 where there is none.
+    if run.metrics and (epoch := run.metrics.warmup.selected.epoch) >= 0:
+        for ax in axes:
+            ax.axvline(epoch + 1, color=RED, linestyle="--", linewidth=1.1,
+                       label=f"teacher: epoch {epoch + 1}")  # fmt: skip
     for ax in axes[:2]:
         ax.legend(fontsize=8.5, frameon=False)
     return figure

@@ -12,7 +12,6 @@ written last, and atomically: it is the mark of a finished run.
         result.pt            what is reported, the warm-up's net or the student's, with all that
                              using it takes (`qs3.load`, qs3/inference/model_file.py)
         predictions.csv      their predictions for the target's test clouds
-        student_selected.pt  of another epoch than the last, if selection.student asks for one
         round_03/pseudo_labels.csv
         history.csv          one row an epoch
         metrics.json         the result

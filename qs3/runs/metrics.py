@@ -57,11 +57,10 @@ class Warmup:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Selection:
-    """By which rule teacher and student were chosen, with the epoch, and the validation split."""
+    """By which rule teacher and student were chosen, with the epoch."""
 
     teacher: str
     student: str
-    validation: str
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -126,21 +125,6 @@ class RoundRecord:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
-class StudentChoice:
-    """How the reported epoch of the last round was chosen, where it is not the last one.
-
-    By the rule's `scores` of each epoch, with so many clouds `held_out` of the round for it.
-    """
-
-    rule: str
-    epoch: int
-    score: float | None
-    scores: dict[str, float | None]
-    held_out: int
-    last: EpochScores
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Quality:
     """What can be estimated of the reported net on the evaluated clouds without their labels.
 
@@ -193,7 +177,7 @@ class RunMetrics:
         source, target: names of the domains; source is the target for `method=supervised`.
         simulated: whether the target is.
         final: the reported scores: the student's, without rounds the warm-up's.
-        validators: label-free scores by name.
+        infomax: see `qs3.evaluation.validators`; None of a net that has diverged.
         versions: of the software that began the run.
     """
 
@@ -214,8 +198,7 @@ class RunMetrics:
     evaluation: Evaluated
     warmup: Warmup
     rounds: list[RoundRecord] = field(default_factory=list)
-    student: StudentChoice | None = None
-    validators: dict[str, float | None]
+    infomax: float | None
     quality: Quality
     data: DataHashes
     made_of: DataMadeOf
@@ -225,7 +208,7 @@ class RunMetrics:
     @property
     def diverged(self) -> bool:
         """Whether the predictions are not numbers: every cloud is of class 0 then."""
-        return self.validators.get("entropy", 0.0) is None
+        return self.infomax is None
 
     @property
     def seen(self) -> dict[str, str]:

@@ -2,8 +2,8 @@
 
     ask Optuna for settings -> launch runs -> read the objective that each returns -> tell Optuna
 
-The objective is a validator of `qs3.evaluation`: accuracy is refused, and so is to vary what says
-how runs are judged (`check_varied`). The study lies in a file next to the runs, so that the same
+The objective is `qs3.evaluation.validators.infomax`. What says how runs are judged may not vary
+(`check_varied`). The study lies in a file next to the runs, so that the same
 command goes on with it. A trial that failed or was interrupted stays open: it is run again, first
 of all. One that diverged is a poor trial, and finished. What Optuna draws for a trial follows from
 (seed, number of the trial): an interrupted search proposes what an uninterrupted one would have.
@@ -36,7 +36,6 @@ from qs3.config.compose import quoted
 from qs3.config.hydra import config_sha256, run_name
 from qs3.config.location import typed
 from qs3.errors import ConfigError
-from qs3.evaluation.validators import LABEL_FREE
 from qs3.runs.metrics import read_metrics
 from qs3.sweeps.plugins import ListedJobs, OverLauncher, RayLauncher
 from qs3.training.provenance import refuse_changed
@@ -158,7 +157,7 @@ class LabelFreeSearch(OverLauncher):
         return create_study(
             storage=JournalStorage(JournalFileBackend(str(self.file))),
             study_name=name,
-            direction="maximize" if LABEL_FREE[cfg.objective].higher_is_better else "minimize",
+            direction="maximize",
             load_if_exists=True,
         )
 
@@ -265,8 +264,7 @@ def report(headline: str, objective: str, tried: Sequence[Tried], fixed: Sequenc
         rows.append((str(one.number), value, *values, run))
     lines = [headline, *aligned(rows)]
     if judged:
-        sign = 1 if LABEL_FREE[objective].higher_is_better else -1
-        _, best = max(judged, key=lambda pair: sign * pair[0])  # the first one wins a tie
+        _, best = max(judged, key=lambda pair: pair[0])  # the first one wins a tie
         search = ("hparams_search=", "objective=", "seed=")
         kept = [word for word in fixed if not word.startswith(search)]
         command = shlex.join([*kept, *_overrides(best.params), "seed=0,1,2"])

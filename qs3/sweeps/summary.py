@@ -20,7 +20,6 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.errors import ConfigError
-from qs3.evaluation.validators import check_objective
 from qs3.runs.metrics import METRICS
 from qs3.sweeps.search import Tried, check_varied, register, report, split
 from qs3.utils.files import make_folder
@@ -51,7 +50,6 @@ class SummaryOfSeeds(Callback):
         if self.objective is not None:
             params = config.hydra.sweeper.get("params") or {}
             try:
-                check_objective(config.objective)
                 check_varied(split(config.hydra.overrides.task, params)[1].values())
             except ConfigError as error:  # Hydra makes a warning of a callback's exception
                 raise SystemExit(f"{type(error).__name__}: {error}") from error

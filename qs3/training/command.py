@@ -57,13 +57,12 @@ def objective_of(cfg: DictConfig, metrics: RunMetrics) -> float | None:
     """What a search looks at, NaN for a run that has diverged; None without a search."""
     if cfg.objective is None:
         return None
-    value = metrics.validators[cfg.objective]
-    return math.nan if value is None else value
+    return math.nan if metrics.infomax is None else metrics.infomax
 
 
 def judged(cfg: DictConfig, metrics: RunMetrics) -> str:
     """The result of a search's trial in one line: no accuracy, it would be nothing to choose by."""
-    value = metrics.validators.get(cfg.objective)
+    value = metrics.infomax
     text = "none: the net has diverged" if value is None else f"{value:.4f}"
     return f"{metrics.experiment}, seed {metrics.seed}: objective={cfg.objective} {text}"
 

@@ -18,7 +18,7 @@ from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms, minimise_entropy
 from qs3.evaluation.ood import limits, ood_reasons_of_all, ood_share, source_limits
 from qs3.evaluation.unlabelled import Prior, expected_accuracy, held_out
-from qs3.evaluation.validators import LABEL_FREE, LAST, PSEUDO_VAL
+from qs3.evaluation.validators import infomax
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result
 from qs3.runs.checkpoints import copy_weights, load, weights_sha256
@@ -30,7 +30,6 @@ from qs3.runs.metrics import (
     Quality,
     RunMetrics,
     Selection,
-    StudentChoice,
     Warmup,
 )
 from qs3.runs.predictions import FILE as PREDICTIONS
@@ -42,7 +41,6 @@ from qs3.runs.predictions import (
     write_predictions_of_files,
 )
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, WarmupSelection
-from qs3.selftraining.student_selection import STUDENT_SELECTED, StudentSelection
 from qs3.store.meta import read_manifest
 from qs3.store.store import HEIGHTS
 from qs3.training.fit import Built
@@ -123,9 +121,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     nets = SavedNets(run, loaded, built)
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
-    choice = None if built.student.rule == LAST else built.student
-    chosen = run.folder / STUDENT_SELECTED
-    file = chosen if choice else files["student" if run.scheme.rounds else "selected"]
+    file = files["student" if run.scheme.rounds else "selected"]
     learnt = loaded.learnt
     if run.scheme.rounds:
         learnt = shares_of_student(run.scheme, loaded.labelled, built.rounds.records[-1])
@@ -143,10 +139,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
 
     scores = {name: evaluation.scores_of(reported(path)) for name, path in files.items()}
     predictions = evaluation.predictions_of(reported(file))
-    prior, parts, student = prior_of(file), component_names(cfg), None
-    if choice is not None:
-        of_last = EpochScores(epoch=run.phases.total - 1, scores=scores["student"])
-        student = StudentChoice(**choice.record(), last=of_last)
+    prior, parts, score = prior_of(file), component_names(cfg), infomax(nets.of("target", file))
     metrics = RunMetrics(
         experiment=cfg.experiment_name,
         hash=config_hash(cfg),
@@ -158,7 +151,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
         method=parts["method"],
         selftraining=parts["selftraining"],
         model=parts["model"],
-        selection=_selection(run, loaded, built.warmup, choice),
+        selection=_selection(run, loaded, built.warmup),
         loading=Loading(
             points=cfg.data.points,
             scale=cfg.data.scale,
@@ -187,8 +180,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
             )
             for record in built.rounds.records
         ],
-        student=student,
-        validators=without_labels(nets.of("target", file), choice),
+        infomax=score if math.isfinite(score) else None,
         quality=_quality(run, loaded, nets, file),
         data=DataHashes(**loaded.started["data"]),
         made_of=loaded.made_of,
@@ -201,20 +193,13 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     return metrics
 
 
-def _selection(
-    run: Run, loaded: Loaded, warmup: WarmupSelection, choice: StudentSelection | None
-) -> Selection:
+def _selection(run: Run, loaded: Loaded, warmup: WarmupSelection) -> Selection:
     """Which weights labelled the target first and which are reported, as text."""
     rule = f"{loaded.data.owner}_val" if warmup.rule == "source_val" else warmup.rule
     teacher = f"{rule}, epoch {warmup.epoch}"
     if rule == "given":
         teacher = f"given, {loaded.started['versions']['weights'].rpartition(' ')[0]}"
-    student = f"{choice.rule}, epoch {choice.epoch}, score {choice.score:.6g}" if choice else LAST
-    return Selection(
-        teacher=teacher,
-        student=student if run.scheme.rounds else teacher,
-        validation="lineage",
-    )
+    return Selection(teacher=teacher, student="last" if run.scheme.rounds else teacher)
 
 
 def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
@@ -231,23 +216,6 @@ def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
         unlike_source=ood_share(loaded.evaluation.test, data.all_labelled),
         never_predicted=[name for name, n in zip(classes, counts, strict=True) if not n],
     )
-
-
-def without_labels(
-    table: Float[np.ndarray, "n c"], choice: StudentSelection | None
-) -> dict[str, float | None]:
-    """The reported net's label-free scores on the target's training clouds, and `pseudo_val`'s.
-
-    None for one that is not a number, of a net that has diverged. SND needs two clouds.
-    """
-    scores = {
-        name: one.score(table)
-        for name, one in LABEL_FREE.items()
-        if name != "snd" or len(table) > 1
-    }
-    if choice is not None and choice.rule == PSEUDO_VAL and choice.score is not None:
-        scores[PSEUDO_VAL] = choice.score
-    return {name: score if math.isfinite(score) else None for name, score in scores.items()}
 
 
 def _write(

@@ -27,7 +27,7 @@ from qs3.methods.base import Method, feature_dims
 from qs3.runs.checkpoints import LAST, copy_weights, save
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.released import ReleasedRounds
-from qs3.selftraining.student_selection import Student, StudentSelection
+from qs3.selftraining.student import Student
 from qs3.training.load import Loaded, load_data, read_given
 from qs3.training.provenance import changed
 from qs3.training.run import STUDENT, Run
@@ -47,7 +47,6 @@ class Built:
     classifier: Classifier
     warmup: WarmupSelection
     rounds: SelfTraining
-    student: StudentSelection
     shared_warmup: SharedWarmup
     clock: Clock
 
@@ -86,15 +85,14 @@ def _build(run: Run, method: Method, loaded: Loaded, given: Result | None, began
     warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
     of_rounds = ReleasedRounds if run.scheme.released else SelfTraining
     rounds = of_rounds(folder, phases, run.scheme, loaded.evaluation.classes)
-    student = StudentSelection(folder, phases, cfg.selection.student)
     # A warm-up of two versions serves no other run.
     sharing = None if changed(loaded.started) else cfg.paths.warmup_dir
     sha256 = warmup_sha256(cfg, loaded.started)
     shared = SharedWarmup(folder, sharing, sha256, run.seed, phases.warmup)
     clock = Clock(began)
-    # In this order: rounds select before the student is scored, and all is done before it is saved.
+    # In this order: all is done before it is saved.
     callbacks: list[Callback] = [
-        *(warmup, rounds, student, EpochRows(folder, phases), clock),
+        *(warmup, rounds, EpochRows(folder, phases), clock),
         *(SaveLast(folder), shared),
     ]
     trainer = _make_trainer(
@@ -114,7 +112,7 @@ def _build(run: Run, method: Method, loaded: Loaded, given: Result | None, began
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     for logger in trainer.loggers:
         logger.log_hyperparams(settings)
-    return Built(trainer, classifier, warmup, rounds, student, shared, clock)
+    return Built(trainer, classifier, warmup, rounds, shared, clock)
 
 
 def _classifier(run: Run, method: Method, given: Result | None) -> Classifier:

@@ -48,7 +48,6 @@ class Rules:
     """Which weights are chosen: the settings `selection`."""
 
     teacher: Literal["source_val", "last", "given"]
-    student: Literal["last", "pseudo_val", "entropy", "infomax", "snd"]
 
 
 @settings
@@ -79,7 +78,7 @@ class Settings:
     num_classes: Annotated[int, Ge(2)]
     weights: str | None
     force: Switch
-    objective: Literal["entropy", "infomax", "snd"] | None  # none looks at the target's labels
+    objective: Literal["infomax"] | None  # does not look at the target's labels
     callbacks: dict[str, Any] | None = None
     logger: dict[str, Any] | None = None
 

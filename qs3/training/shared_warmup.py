@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 _FILES = (HISTORY, LAST)
 # Not `selection`: the checkpoint holds the teacher chosen so far.
-_AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_name")
+_AFTERWARDS = ("selftraining", "evaluation", "experiment_name")
 
 
 def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:

@@ -48,14 +48,12 @@ def metrics(seed=0, accuracy=0.5, **changes):
         "selftraining": "qbst",
         "model": "dgcnn",
         "simulated": True,
-        "selection": Selection(
-            teacher=f"source_val, epoch {epoch}", student="last", validation="lineage"
-        ),
+        "selection": Selection(teacher=f"source_val, epoch {epoch}", student="last"),
         "loading": Loading(points=1024, scale="unit_ball", fps_starts=4, sampler="shuffled"),
         "final": scores(accuracy),
         "evaluation": Evaluated(split="test", labels=accuracy is not None, norms="trained"),
         "warmup": Warmup(selected=before, last=before),
-        "validators": {"infomax": 0.5},
+        "infomax": 0.5,
         "quality": Quality(
             validation_accuracy=0.9,
             unlike_source=0.1,

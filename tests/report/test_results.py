@@ -105,8 +105,8 @@ def test_one_recipe_on_two_machines_is_averaged(tmp_path, role):
 
 
 def test_a_diverged_seed_is_averaged_and_shown(tmp_path):
-    for seed, entropy in ((0, -0.4), (1, None)):
-        write_run(tmp_path, seed=seed, validators={"entropy": entropy})
+    for seed, infomax in ((0, 0.4), (1, None)):
+        write_run(tmp_path, seed=seed, infomax=infomax)
     assert runs(tmp_path).stat("accuracy").n == 2
     assert "seeds 1: the net has diverged" in runs(tmp_path).problems[0]
 

@@ -16,7 +16,7 @@ from qs3.config.hydra import config_sha256, run_folder
 from qs3.errors import DataError, MissingDataError
 from qs3.report import run_page
 from qs3.report.run_page import AfterTraining, draw, read_run
-from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
+from qs3.runs.metrics import DataHashes, Scores, read_metrics
 from qs3.runs.predictions import read_predictions, write_predictions
 from qs3.training.command import train
 from tests.report.made_runs import change, not_blank, table
@@ -69,10 +69,6 @@ def test_files_and_page(run, tmp_path):
 
 
 def test_curves_are_the_history(run):
-    last = EpochScores(epoch=6, scores=read_metrics(run).final)
-    scores = {"4": 0.1, "5": 0.3, "6": 0.2}
-    student = StudentChoice(rule="snd", epoch=5, score=0.3, scores=scores, held_out=0, last=last)
-    change(run, student=student)
     rows, axes = (
         table(run / "history.csv"),
         run_page._curves(read_run(run), read_run(run).history).axes,
@@ -86,7 +82,6 @@ def test_curves_are_the_history(run):
     assert [p.get_x() for p in axes[0].patches] == [0.5, 5.5]  # warm-up and every other round
     teacher = read_metrics(run).warmup.selected.epoch
     assert line(axes[0], f"teacher: epoch {teacher + 1}")[0].tolist() == [teacher + 1] * 2
-    assert line(axes[1], "student: epoch 6")[0].tolist() == [6, 6]
 
 
 def test_pseudo_labels_are_those_of_the_tables(run):

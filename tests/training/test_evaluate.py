@@ -130,7 +130,7 @@ def test_the_reported_probabilities_are_weighed_and_estimates_are_not(toy) -> No
     assert "; with evaluation.prior; data: " in headline(after)
     assert "evaluation.prior" not in headline(before)
     assert after.quality == before.quality
-    assert after.validators == before.validators
+    assert after.infomax == before.infomax
 
 
 @pytest.fixture(scope="module")

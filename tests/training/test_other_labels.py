@@ -112,6 +112,6 @@ def test_same_weights_predictions_and_estimates(data, tmp_path, case) -> None:
             for path in (pseudo_labels_path(folder, record.round) for folder in (one, two))
         ]
         assert rows[0] == rows[1]
-    assert (ours.quality, ours.validators) == (theirs.quality, theirs.validators)
+    assert (ours.quality, ours.infomax) == (theirs.quality, theirs.infomax)
     assert ours.selection == theirs.selection
     assert ours.final != theirs.final  # the labels do judge

@@ -36,9 +36,7 @@ SCHEMES = {
     "beside": ("selftraining=qbst_beside",),
     "steps": ("selftraining=qbst", "protocol.steps=8", "selftraining.steps=5"),
     "continued_alone": ("selftraining=qbst", "selftraining.init=continue", "selftraining.pcm=true"),
-    "pseudo_val": ("selection.student=pseudo_val",),
-    "snd": ("selection.student=snd",),
-    "double": ("trainer.precision=64-true", "selection.student=infomax"),
+    "double": ("trainer.precision=64-true",),
 }
 METHODS = {
     "source_only": ("method=source_only",),
