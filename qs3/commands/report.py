@@ -250,20 +250,25 @@ def page(
 def pipeline(
     *,
     domain: Annotated[str, "of conf/domain"],
-    object: Annotated[str | None, "its id (default: a chair)"] = None,
+    object: Annotated[str | None, "its id, or a room's (default: a chair, the first room)"] = None,
     mesh: Annotated[Path | None, "a mesh file to scan in place of the domain's objects"] = None,
     view: Annotated[int, Ge(0), "whose images are shown"] = 0,
     out: Annotated[Path, "the picture"] = Path("pipeline.png"),
     **overrides: Annotated[str, "of generate.py, such as sensor=kinect_v1"],
 ) -> None:
-    """Draw one object from images to residuals.
+    """Draw one object from images to residuals, or a furnished room and what is cut from it.
 
     Example:
         qs3 report pipeline domain=specklenet10 sensor=kinect_v1 mesh=chair.glb out=chair.png
+        qs3 report pipeline domain=rooms10 out=room.png
     """
-    from qs3.report.pipeline import pipeline_figure, scan_object
+    from qs3.report.pipeline import makes_rooms, pipeline_figure, room_figure, scan_object
     from qs3.utils.pictures import save_png
 
     words = [f"domain={domain}", *(f"{key}={value}" for key, value in overrides.items())]
-    save_png(pipeline_figure(scan_object(words, object, mesh), view), out, colours=256)
+    if makes_rooms(words):
+        figure = room_figure(words, object)
+    else:
+        figure = pipeline_figure(scan_object(words, object, mesh), view)
+    save_png(figure, out, colours=256)
     print(out)

@@ -1,7 +1,7 @@
-"""One object on its way from mesh to cloud, and the figure that shows every stage.
+"""One object on its way from mesh to cloud, or one room, and the figure that shows the stages.
 
 Images are of one view; clouds are all views together, seen from the side of the camera. The bytes
-are those that `generate.py` makes of the object.
+are those that `generate.py` makes of the object or room.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from scipy.spatial import cKDTree
 
 from qs3.generation.kept import Keep, view_images
 from qs3.generation.plan import planned
+from qs3.generation.rooms import Rooms
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import Up, load_mesh
 from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.sensors.base import DepthFrame
-from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet
+from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, turn_deg, value_image
 from qs3.utils.seeding import object_rng
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 _OFTEN_THERE = "chair/train/chair_0000"
 _ASIDE_DEG = 40.0  # of the camera, so that errors of depth are seen
 _SIDE_PX, _PANEL_IN = 800, 2.8
+_ROW = 4  # pictures
 _SURFACE = 1_000_000  # samples of a mesh, one or two millimetres apart
 
 Picture = tuple[str, Image]
@@ -126,6 +128,55 @@ def scan_object(
     placed = recipe.placing.place(loaded, object_rng(cfg.seed, item.id, 0), item.id)
     clouds = made["points"], made.get("points_clean")
     return ScannedObject(item.id, label, tuple(views), *clouds, placed)
+
+
+def makes_rooms(overrides: Sequence[str]) -> bool:
+    """Whether a domain's recipe furnishes rooms."""
+    from qs3.config.compose import composed
+
+    return isinstance(planned(composed("generate", *overrides)).recipe, Rooms)
+
+
+def room_figure(overrides: Sequence[str], room: str | None = None) -> Figure:
+    """Draw a furnished room from four places, its things in colours, and clouds cut from it.
+
+    Args:
+        overrides: of generate.py, such as ["domain=rooms10"].
+        room: its id; None: the first of the domain's.
+    """
+    from matplotlib import colormaps
+
+    from qs3.config.compose import composed
+    from qs3.config.hydra import build
+    from qs3.generation.scan import Scanner
+
+    cfg = composed("generate", *overrides)
+    item = next(one for one in planned(cfg).tasks if room in (None, one.id))
+    frames: list[DepthFrame] = []
+    scanner = Scanner(cfg)
+    made = scanner.cloud(item.load(), item.id, Keep(view=lambda _, *seen: frames.append(seen[1])))
+    assert made.found is not None
+    fullest = sorted(frames, key=lambda frame: -len(np.unique(frame.label)))[:_ROW]
+    shown: list[Picture] = []
+    for frame in fullest:
+        low, high = np.nanpercentile(-frame.depth_m, [2, 98])
+        near = value_image(-frame.depth_m, low, high, "gray")
+        tint = 255 * colormaps["tab20"]((frame.label - 1) % 20)[..., :3]
+        thing = (frame.label > 0) & np.isfinite(frame.depth_m)
+        near[thing] = (0.45 * near[thing] + 0.55 * tint[thing]).astype(np.uint8)
+        far = np.nanmax(frame.depth_m)
+        shown.append((f"depth to {far:.1f} m, {len(np.unique(frame.label)) - 1} things", near))
+    of_class = {
+        found.cls: points for found, points in zip(made.found, made.arrays["points"], strict=True)
+    }
+    for cls, points in list(of_class.items())[: 2 * _ROW]:
+        azimuth = AZIMUTH_DEG + turn_deg(points)
+        size = np.ptp(points, axis=0).max()
+        shown.append((f"{cls}, {size:.2f} m", cloud_image(points, _SIDE_PX, azimuth)))
+    titles, images = zip(*shown, strict=True)
+    words = f"{item.id}, {build(cfg.domain).label}"
+    words += f": {len(made.found)} clouds of {len(frames)} pictures"
+    return sheet(images, titles, columns=_ROW, heading=words, panel_in=_PANEL_IN)
 
 
 def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:

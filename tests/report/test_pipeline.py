@@ -1,12 +1,13 @@
 """The pipeline of one object: its residuals are true ones, the figure shows what there is."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 
-from qs3.report.pipeline import pipeline_figure, scan_object
+from qs3.report.pipeline import makes_rooms, pipeline_figure, room_figure, scan_object
 from tests.report.made_runs import not_blank
 from tests.running import main
 
@@ -55,6 +56,17 @@ def test_surface_samples_are_a_cloud_and_nothing_else():
     assert "samples of the surface" in (told := words(pipeline_figure(one)))
     assert "view" not in told
     assert one.residual_m.max() < 5e-3
+
+
+def test_a_room_and_what_is_cut_from_it():
+    small = ["domain=rooms10", "limit=3", "rooms=0.1", "recipe.views=3"]
+    assert makes_rooms(small)
+    assert not makes_rooms(["domain=specklenet10"])
+    told = words(room_figure(small))
+    assert "room/train/room_000000" in told
+    cut, seen = map(int, re.search(r"(\d+) clouds of (\d+) pictures", told).groups())
+    assert 0 < told.count("depth to") == seen <= 3
+    assert 0 < len(re.findall(r"\w+, \d\.\d\d m", told)) <= cut
 
 
 def test_command_with_a_mesh_of_ones_own(tmp_path):
