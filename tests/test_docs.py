@@ -5,8 +5,11 @@ import re
 import shlex
 import tomllib
 from pathlib import Path
+from textwrap import indent
 
+from qs3.__main__ import ABOUT, COMMANDS
 from qs3.classes import CLASSES
+from qs3.utils.commands import run
 from tests.composing import compose
 from tests.running import main
 
@@ -41,7 +44,7 @@ def test_commands_of_the_documents_exist(capsys):
             words = shlex.split(line.split("  ")[0].split(" #")[0].replace("...", ""))
             if words[0] == "python":
                 assert words[1].startswith("-") or (ROOT / words[1]).is_file(), (page, line)
-            elif "COMMAND" not in words:
+            elif "COMMAND" not in line:
                 name = words[1:3] if words[1] == "report" else words[1:2]
                 keys = {re.split(r"[.=]", word)[0] for word in words if "=" in word}
                 shown.setdefault(tuple(name), set()).update(keys)
@@ -51,6 +54,11 @@ def test_commands_of_the_documents_exist(capsys):
         assert main([*name, "--help"]) == 0, name
         known = capsys.readouterr().out
         assert not {key for key in keys if key not in known}, name
+
+
+def test_the_page_of_commands_is_their_help(capsys):
+    assert run(COMMANDS, ["--help"], about=ABOUT) == 0
+    assert indent(capsys.readouterr().out.strip(), "    ") in text_of("docs/reference/commands.md")
 
 
 def test_layers_are_those_of_the_contract():
