@@ -41,7 +41,7 @@ def test_experiment_runs(experiment, published, tmp_path):
         "logger=csv", "seed=0", "trainer.threads=1",
         f"paths.data_dir={published.folder}", f"paths.log_dir={tmp_path}",
     ]  # fmt: skip
-    if experiment == "own_meshes":
+    if experiment in ("own_meshes", "own_scans"):
         overrides += ["data.target.floor_m=0"]
     cfg = compose("train", overrides)
     for domain in (cfg.data.source, cfg.data.target):
