@@ -260,6 +260,8 @@ class Runs:
 
 def same_data(lines: pd.DataFrame, key: str) -> bool:
     """Whether runs saw the same: equal hashes in a column, or datasets made by one recipe."""
+    if lines.empty:
+        return True
     recipes = lines.get(key.replace("_data", "_recipe"))
     one_recipe = key != "weights" and recipes is not None and recipes.nunique() == 1
     return lines[key].nunique() < 2 or bool(one_recipe and recipes.iloc[0])

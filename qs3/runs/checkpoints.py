@@ -53,9 +53,9 @@ def copy_weights(net: nn.Module) -> dict[str, torch.Tensor]:
 
 
 def weights_sha256(weights: Mapping[str, torch.Tensor]) -> str:
-    """A hash of names, types, shapes and values: equal for equal weights, to the bit."""
+    """A hash of names, types, shapes and values: equal for equal weights, in any order."""
     digest = hashlib.sha256()
-    for name, value in weights.items():
+    for name, value in sorted(weights.items()):  # safetensors has another order each time
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
         digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
     return digest.hexdigest()

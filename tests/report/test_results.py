@@ -54,6 +54,8 @@ def test_unfinished_and_damaged_seeds_are_shown(tmp_path):
     assert found.stat("accuracy").n == 1
     text = "\n".join(found.problems)
     assert f"seed 1: unfinished ({begun})" in text
+    alone = Runs(found.lines[found.lines.seed == 1].dropna(axis=1))  # none is finished
+    assert alone.problems == [f"seed 1: unfinished ({begun})"]
     assert "metrics.json is damaged" in text
 
 

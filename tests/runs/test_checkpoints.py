@@ -12,7 +12,7 @@ import torch
 
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs import checkpoints
-from qs3.runs.checkpoints import load, save
+from qs3.runs.checkpoints import load, save, weights_sha256
 from tests.fixtures.harm import Harm
 
 KINDS = {"last.ckpt", "result.pt", "student.pt", "warmup_last.pt", "warmup_selected.pt"}
@@ -28,6 +28,15 @@ def test_every_file_loads_without_unpickling_objects(finished):
             assert torch.load(path, map_location="cpu", weights_only=True)
     finally:
         torch.serialization.add_safe_globals(added)
+
+
+def test_a_hash_does_not_depend_on_the_order():
+    """Of which safetensors makes another one each time that it reads a file."""
+    weights = {"a.weight": torch.arange(6.0).view(2, 3), "a.bias": torch.ones(2)}
+    sha256 = weights_sha256(weights)
+    assert sha256 == weights_sha256(dict(reversed(weights.items())))
+    assert sha256 != weights_sha256(weights | {"a.bias": torch.zeros(2)})
+    assert sha256 != weights_sha256({"b.bias": torch.ones(2), "a.weight": weights["a.weight"]})
 
 
 def test_student_result_and_checkpoint_have_the_same_weights(finished):
