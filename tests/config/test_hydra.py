@@ -65,7 +65,7 @@ def test_a_value_from_outside_is_hashed_as_it_is(tmp_path, monkeypatch):
 
 
 def hash_of(*words, **values):
-    cfg = compose("train", ["experiment=own_scans", *words])
+    cfg = compose("train", ["experiment=quickstart", *words])
     for key, value in values.items():
         OmegaConf.update(cfg, key, value, force_add=True)
     return config_hash(cfg)
