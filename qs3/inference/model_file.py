@@ -26,14 +26,13 @@ import safetensors.torch
 import torch
 from annotated_types import Ge, Gt, Len
 from jaxtyping import Float
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.unlabelled import HeldOut
 from qs3.runs.checkpoints import load, save
 from qs3.utils.files import atomic_path, make_folder, reading, sha256_file, write_json, write_text
-from qs3.utils.settings import problems
 from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
 
@@ -166,7 +165,7 @@ def read_result(path: str | Path) -> Result:
     """Read and check what `write_result` or `write_folder` wrote; nothing in it is run."""
     file = find_result(path)
     if file.name != WEIGHTS:
-        return _checked(file, load(file, advice="copy it again, or repeat its run"))
+        return _checked(file, load(file))
     config = file.with_name(CONFIG)
     with reading(config):
         values, data = json.loads(config.read_bytes()), file.read_bytes()
@@ -220,7 +219,4 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
 def _checked(file: Path, found: Any) -> Result:
     """The file's values as a `Result`."""
     with reading(file):
-        try:
-            return _RESULT.validate_python({k: found[k] for k in found if k != "qs3"})
-        except ValidationError as error:
-            raise ValueError(problems(error)) from error
+        return _RESULT.validate_python({k: found[k] for k in found if k != "qs3"})

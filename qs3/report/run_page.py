@@ -19,7 +19,7 @@ import numpy as np
 
 from qs3.config.hydra import in_multirun
 from qs3.datasets.domain import Domain
-from qs3.errors import DataError, MissingDataError, Qs3Error
+from qs3.errors import MissingDataError, Qs3Error
 from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.inference.page import confusion_rows
@@ -31,7 +31,7 @@ from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.store.meta import is_finished
 from qs3.store.store import PointSet
-from qs3.utils.files import make_folder, write_text
+from qs3.utils.files import make_folder, reading, write_text
 from qs3.utils.page import render
 from qs3.utils.pictures import BLUE, GREEN, GRID, ORANGE, RED, SOFT, blank, save_png
 
@@ -78,7 +78,6 @@ def is_run(folder: Path) -> bool:
 def read_run(folder: str | Path) -> RunFiles:
     """Read a run's folder."""
     import pandas as pd
-    import yaml
     from omegaconf import OmegaConf
 
     folder = Path(folder).expanduser()
@@ -89,15 +88,13 @@ def read_run(folder: str | Path) -> RunFiles:
         predictions = read_predictions(folder / PREDICTIONS)
     classes = tuple(metrics.final.predicted) if metrics else ()
     hydra: dict[str, Any] = {"config": None, "overrides": ()}
-    try:
+    with reading(f"{folder}: {HISTORY} or .hydra"):
         if (folder / HISTORY).is_file():
             history = pd.read_csv(folder / HISTORY)
             history = history if len(history) else None
         for name in hydra:
             if (path := folder / ".hydra" / f"{name}.yaml").is_file():
                 hydra[name] = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
-    except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
-        raise DataError(f"{folder}: {HISTORY} or .hydra is damaged ({error})") from error
     command = shlex.join(["python", "train.py", *map(str, hydra["overrides"])])
     return RunFiles(folder, metrics, history, predictions, classes, hydra["config"], command)
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from qs3.config.compose import composed, override
 from qs3.config.location import typed
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError, Qs3Error
 from qs3.report.results import (
     NO_RUNS,
     Runs,
@@ -226,7 +226,7 @@ def kept_lines(table: Table) -> pd.DataFrame:
     for run in lines.to_dict("records"):
         try:
             found.append(answers_of(run).as_text if run["take"] == "final" else {})
-        except DataError:  # a run without predictions
+        except Qs3Error:  # a run without predictions
             found.append({})
     answers = pd.DataFrame(found)
     known = lines.drop(columns=["folder", "problem", *answers.columns], errors="ignore")

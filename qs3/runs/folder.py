@@ -26,7 +26,7 @@ from typing import Any
 
 from qs3.errors import ConfigError, DataError
 from qs3.runs.metrics import METRICS
-from qs3.utils.files import write_json
+from qs3.utils.files import reading, write_json
 
 STARTED = "started.json"
 _ANEW = "choose another experiment_name, or start again with force=true"
@@ -37,12 +37,10 @@ _KEPT_WHEN_CLEARED = (".hydra", ".lock")
 def read_started(folder: str | Path) -> dict[str, Any] | None:
     """What `write_started` saved; None if the run never got that far."""
     path = Path(folder) / STARTED
-    try:
-        return dict(json.loads(path.read_bytes()))
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise DataError(f"{path} cannot be read ({error}); run with force=true") from error
+    with reading(path):
+        return dict(json.loads(path.read_bytes()))
 
 
 def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:

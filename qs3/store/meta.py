@@ -19,8 +19,8 @@ from typing import Any, ClassVar
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
-from qs3.errors import DataError, MissingDataError
-from qs3.utils.files import write_text
+from qs3.errors import DataError
+from qs3.utils.files import reading, write_text
 from qs3.utils.text_table import csv_text
 
 META = "meta.yaml"
@@ -117,12 +117,8 @@ def write_meta(folder: Path, facts: Mapping[str, Any], others: Mapping[str, Any]
 def read_meta(folder: str | Path) -> dict[str, Any]:
     """The contents of a finished dataset's meta.yaml, checked against its last line."""
     path = Path(folder) / META
-    try:
+    with reading(path):
         text = path.read_bytes().decode()
-    except FileNotFoundError as error:
-        raise MissingDataError(f"there is no finished dataset in {folder} (no {META})") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
     body, mark, checksum = text.rpartition(_CHECKSUM)
     if not mark or checksum != sha256_of(body) + "\n":
         raise DataError(f"{path} is damaged or was edited (its checksum is wrong); {AGAIN}")
@@ -184,11 +180,9 @@ def read_manifest(
 ) -> list[ManifestRow]:
     """All rows of a dataset's manifest.csv, failed ones included."""
     path = Path(folder) / MANIFEST
-    try:
+    with reading(path):
         data = path.read_bytes()
         rows = _from_csv(data.decode())
-    except (OSError, ValueError, csv.Error) as error:
-        raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
     check_rows(rows, tuple(classes), where=str(path))
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
         raise DataError(

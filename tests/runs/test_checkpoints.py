@@ -118,7 +118,7 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
 
 def test_nothing_is_unpickled(tmp_path):
     torch.save({"w": torch.zeros(9), "harm": Harm(tmp_path / "harm")}, tmp_path / "a.pt")
-    with pytest.raises(DataError, match="UnpicklingError"):
+    with pytest.raises(DataError, match="Weights only"):
         load(tmp_path / "a.pt")
     assert not (tmp_path / "harm").exists()
 
