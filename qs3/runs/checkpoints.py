@@ -6,6 +6,7 @@ another weight; here it is compared whenever a file is read.
 """
 
 import hashlib
+import io
 import os
 import zipfile
 from collections.abc import Mapping
@@ -16,26 +17,22 @@ from torch import nn
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from qs3.errors import ConfigError
-from qs3.utils.files import atomic_path, reading
+from qs3.utils.files import reading, write_bytes
 
 LAST = "last.ckpt"
 
 
 def save(value: Any, path: str | os.PathLike[str]) -> None:
     """Save tensors and plain values to `path`, atomically; others, such as numpy's, are refused."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        try:
-            torch.save(value, file)
-        except RuntimeError as error:  # torch complains of the half file, not of what broke it off
-            if isinstance(error.__context__, OSError | KeyboardInterrupt | SystemExit):
-                raise error.__context__ from error
-            raise
-        file.flush()
-        if kinds := get_unsafe_globals_in_checkpoint(temporary):
-            raise ConfigError(
-                f"{path} would hold {', '.join(kinds)} and could not be read again: keep tensors "
-                "and plain values alone, with float(...) for instance"
-            )
+    file = io.BytesIO()  # of a file that a full disk breaks off torch complains in its own words
+    torch.save(value, file)
+    file.seek(0)
+    if kinds := get_unsafe_globals_in_checkpoint(file):
+        raise ConfigError(
+            f"{path} would hold {', '.join(kinds)} and could not be read again: keep tensors "
+            "and plain values alone, with float(...) for instance"
+        )
+    write_bytes(path, file.getvalue())
 
 
 def load(path: str | os.PathLike[str], device: Any = "cpu") -> Any:
