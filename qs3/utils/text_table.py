@@ -34,12 +34,9 @@ def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
 
 def csv_text(rows: Iterable[Iterable[Any]]) -> str:
     r"""CSV whose lines end with `\n`; None is an empty cell, a float has all its digits."""
-    lines = []
-    for row in rows:
-        file = io.StringIO(newline="")
-        csv.writer(file).writerow(row)  # ended by \r\n it quotes cells with a \r of their own
-        lines.append(file.getvalue().removesuffix("\r\n") + "\n")
-    return "".join(lines)
+    file = io.StringIO(newline="")
+    csv.writer(file, lineterminator="\n").writerows(rows)
+    return file.getvalue()
 
 
 def printable(text: str) -> str:
