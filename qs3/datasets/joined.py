@@ -71,7 +71,7 @@ class Joined(Importer):
                     f"{folder} has the classes {', '.join(data.classes)}, not "
                     f"{', '.join(classes)}, or stands twice in published.datasets"
                 )
-            kept = (row for row in read_manifest(folder, data.classes) if row.status == OK)
+            kept = (row for row in read_manifest(folder) if row.status == OK)
             for i, row in enumerate(kept):
                 object_ = FURTHER_SCAN.sub("", row.id)
                 number = scans[object_]

@@ -197,7 +197,7 @@ def write_pointset(
     """
     folder = Path(folder)
     rows, classes, tables = number(rows), tuple(classes), dict(tables or {})
-    check_rows(rows, classes, where=f"rows of dataset {name!r}")
+    check_rows(rows, classes, name)
     clouds = sum(row.status == OK for row in rows)
     points = _shape(arrays["points"])[1] if clouds else 0
     for key, array in arrays.items():
@@ -248,7 +248,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     have = sorted(set(hashes) - {"manifest", *(meta.get("tables") or {})})
     if variant not in have:
         raise DataError(f"{folder} holds the arrays {have}, not {variant!r}: generate it again")
-    rows = read_manifest(folder, classes, hashes["manifest"])
+    rows = read_manifest(folder)
     kept = [row for row in rows if row.status == OK]
     points = _open_array(folder, variant, meta, verify)
     for start in range(0, len(points), _CHUNK_CLOUDS):
