@@ -4,8 +4,6 @@ What an unfinished run does not have is None. A chart that has nothing to show i
 page gives the reason. Labels of the target judge a finished run; nothing is chosen by them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import logging
 import shlex
@@ -13,9 +11,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 
 from qs3.config.hydra import in_multirun
 from qs3.datasets.domain import Domain
@@ -34,10 +35,6 @@ from qs3.store.store import PointSet
 from qs3.utils.files import make_folder, reading, write_text
 from qs3.utils.page import render
 from qs3.utils.pictures import BLUE, GREEN, GRID, ORANGE, RED, SOFT, blank, save_png
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
@@ -77,9 +74,6 @@ def is_run(folder: Path) -> bool:
 
 def read_run(folder: str | Path) -> RunFiles:
     """Read a run's folder."""
-    import pandas as pd
-    from omegaconf import OmegaConf
-
     folder = Path(folder).expanduser()
     if not is_run(folder):
         raise MissingDataError(f"{folder} is not the folder of a run")
@@ -104,10 +98,6 @@ def _target_of(run: RunFiles, data_dir: str | Path | None) -> tuple[Domain, Poin
 
     Nothing is imported or made.
     """
-    from omegaconf import OmegaConf
-
-    import qs3.config.hydra  # noqa: F401 (registers the resolvers of a config)
-
     if run.config is None:
         raise MissingDataError(f"{run.folder} has no .hydra/config.yaml that names its data")
     cfg = OmegaConf.create(dict(run.config))
@@ -150,8 +140,6 @@ def draw(
         data_dir: where the datasets lie; None: where the run's config says.
         config: of the run; None: what Hydra wrote into its folder.
     """
-    from omegaconf import OmegaConf
-
     run = read_run(folder)
     if config is not None:
         run = dataclasses.replace(run, config=config)
@@ -241,8 +229,6 @@ def pseudo_labels(rounds: Sequence[RoundRecord], classes: Sequence[str]) -> pd.D
 
     And what they are worth: precision and recall know the target's labels, which judge alone.
     """
-    import pandas as pd
-
     columns = {}
     for one in rounds:
         kept, by_class = ("thresholds", one.thresholds) if one.mu is None else ("mu", one.mu)
