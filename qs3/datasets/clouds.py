@@ -278,13 +278,16 @@ def _label(label: Any, classes: Sequence[str], where: Path) -> str:
     return class_of(str(label), classes, where)
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    """All files of known formats below a folder; links to folders are not followed."""
+def visible_files(folder: Path) -> Iterator[Path]:
+    """All files below a folder that are not hidden; links to folders are not followed."""
     for path in folder.rglob("*"):
         below = path.relative_to(folder).parts
-        hidden = any(part.startswith(".") or part == "__MACOSX" for part in below)
-        if path.suffix.lower() in SUFFIXES and not hidden and path.is_file():
+        if not any(part.startswith((".", "__MACOSX")) for part in below) and path.is_file():
             yield path
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in visible_files(folder) if path.suffix.lower() in SUFFIXES)
 
 
 def _text(path: Path) -> CloudFile:
