@@ -38,9 +38,6 @@ from qs3.utils.version import VERSION
 
 FILE = "result.pt"
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
-EXPORTED = (".onnx", ".pt2")
-"""What `qs3 export` writes for other programs."""
-
 PACKAGES = ("qs3.models",)
 """Packages that a file may take its net from."""
 
@@ -150,8 +147,6 @@ def find_result(path: str | Path) -> Path:
     if str(path) in pretrained_names() and not Path(path).exists():
         path = PRETRAINED / path
     path = Path(path).expanduser()
-    if path.suffix.lower() in EXPORTED:
-        raise ConfigError(f"{path} lacks what prepares its clouds; give what it was exported from")
     for file in (path, path / FILE, path / WEIGHTS):
         if file.is_file():
             return file

@@ -181,8 +181,6 @@ class Predictor:
             DataError: names the cloud that is empty or not finite.
             ConfigError: `floor` is needed.
         """
-        if getattr(clouds, "ndim", 3) == 2:
-            raise DataError("got one cloud; give a list of them, predictor([cloud])")
         arrays = list(clouds)
         if not arrays:
             return np.empty((0, len(self.classes)))
