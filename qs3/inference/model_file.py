@@ -151,8 +151,7 @@ def find_result(path: str | Path) -> Path:
         if file.is_file():
             return file
     raise MissingDataError(
-        f"{path} is not a finished run, and has no {FILE}; give its folder, or one of "
-        f"{', '.join(pretrained_names())}"
+        f"{path} is not a finished run, nor one of {', '.join(pretrained_names())}"
     )
 
 
@@ -204,10 +203,7 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
         except ImportError as error:
             why = str(error)
     if not callable(make) or getattr(make, "__module__", None) != module:
-        raise DataError(
-            f"the file's model {target} is refused: {why}; name the package of a net of your own, "
-            "packages="
-        )
+        raise DataError(f"the file's model {target} is refused: {why}; see packages=")
     return make
 
 

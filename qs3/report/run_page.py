@@ -111,9 +111,7 @@ def _target_of(run: RunFiles, data_dir: str | Path | None) -> tuple[Domain, Poin
         raise MissingDataError(f"the run's target, {domain.name}, is not at {domain.folder}")
     data = domain.open(verify=False)
     if data.sha256 != run.metrics.data.target:
-        raise MissingDataError(
-            f"{domain.folder} holds another version of {domain.name} than the run used"
-        )
+        raise MissingDataError(f"{domain.folder} is not the {domain.name} that the run used")
     return domain, data
 
 

@@ -28,10 +28,7 @@ def save(value: Any, path: str | os.PathLike[str]) -> None:
     torch.save(value, file)
     file.seek(0)
     if kinds := get_unsafe_globals_in_checkpoint(file):
-        raise ConfigError(
-            f"{path} would hold {', '.join(kinds)} and could not be read again: keep tensors "
-            "and plain values alone, with float(...) for instance"
-        )
+        raise ConfigError(f"{path} could not be read again: keep no {', '.join(kinds)} in it")
     write_bytes(path, file.getvalue())
 
 

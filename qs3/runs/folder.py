@@ -60,10 +60,7 @@ def check_data(folder: Path, domain: str, expected: str, found: str) -> None:
 def check_config(folder: Path, expected: str | None, found: str) -> None:
     """Raise ConfigError rather than continue, or reuse, the run of another config."""
     if found != expected:
-        raise ConfigError(
-            f"{folder} holds a run with other settings (config hash {expected}, now {found}; they "
-            f"are in .hydra/config.yaml); {_ANEW}"
-        )
+        raise ConfigError(f"{folder} has other settings, see its .hydra/config.yaml; {_ANEW}")
 
 
 def clear(folder: str | Path) -> None:

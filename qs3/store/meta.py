@@ -201,10 +201,7 @@ def check_rows(rows: Sequence[ManifestRow], classes: Sequence[str], name: str) -
         unread = row.status != OK and not row.cls  # its file did not even give the class
         known = row.cls in classes or unread or not labelled
         if ids[row.id] > 1 or not row.id or not known or row.split not in SPLITS:
-            raise DataError(
-                f"dataset {name!r}: {row.id!r} of class {row.cls!r} and split {row.split!r}: an id "
-                f"that is missing or comes twice, or not of {', '.join((*classes, *SPLITS))}"
-            )
+            raise DataError(f"dataset {name!r}: an id twice, or an unknown class or split: {row}")
 
 
 def to_csv(rows: Sequence[ManifestRow]) -> str:

@@ -113,9 +113,7 @@ class PointSet:
         """The clouds of one split, in order; a view of the memmap if they are adjacent."""
         chosen = self.indices(split)
         if len(chosen) == 0:
-            raise DataError(
-                f"dataset {self.name!r} has no split {split!r}; it has {sorted(self.counts())}"
-            )
+            raise DataError(f"dataset {self.name!r} has no split {split!r}")
         adjacent = chosen[-1] - chosen[0] + 1 == len(chosen)
         return self.at(slice(int(chosen[0]), int(chosen[-1]) + 1) if adjacent else chosen)
 
