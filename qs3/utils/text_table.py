@@ -19,17 +19,16 @@ def aligned(rows: Rows, *, numbers: bool = False, rule: bool = True) -> list[str
     return [first, *rules, *lines]
 
 
-def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
-    """Lines of Markdown, which are readable as they are, too; for `numbers` see `aligned`.
+def markdown(rows: Rows) -> list[str]:
+    """Lines of Markdown, which are readable as they are, too.
 
     A `|` in a cell is escaped; what else Markdown reads as a sign is kept.
     """
     rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
-    padded = _padded(rows, numbers)
+    padded = _padded(rows, numbers=False)
     first, *lines = [f"| {' | '.join(cells)} |" for cells in padded]
-    end = ":" if numbers else "-"
-    rules = ["-" * (len(cell) + 1) + (end if i else "-") for i, cell in enumerate(padded[0])]
-    return [first, f"|{'|'.join(rules)}|", *lines]
+    rule = "|".join("-" * (len(cell) + 2) for cell in padded[0])
+    return [first, f"|{rule}|", *lines]
 
 
 def csv_text(rows: Iterable[Iterable[Any]]) -> str:

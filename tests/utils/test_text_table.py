@@ -16,7 +16,6 @@ def test_aligned_text_and_markdown():
     assert aligned(ROWS, numbers=True, rule=False) == ["class     n", "a|b    1000", "é       5 %"]
     first, rule, second, _ = markdown(ROWS)
     assert (first, rule, second) == ("| class | n    |", "|-------|------|", r"| a\|b  | 1000 |")
-    assert markdown(ROWS[:1], numbers=True) == ["| class | n |", "|-------|--:|"]
 
 
 cell = st.text(st.characters(exclude_characters="\r"), max_size=5)
