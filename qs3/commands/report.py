@@ -256,7 +256,7 @@ def pipeline(
     out: Annotated[Path, "the picture"] = Path("pipeline.png"),
     **overrides: Annotated[str, "of generate.py, such as sensor=kinect_v1"],
 ) -> None:
-    """Draw one object from images to residuals, or a furnished room and what is cut from it.
+    """Draw one object from images to residuals, or a room and what is cut from it.
 
     Example:
         qs3 report pipeline domain=specklenet10 sensor=kinect_v1 mesh=chair.glb out=chair.png

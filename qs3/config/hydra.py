@@ -26,8 +26,8 @@ from pydantic import ValidationError
 
 from qs3.classes import CLASSES, class_list
 from qs3.config.location import CONF, PACKAGE, typed
-from qs3.errors import ConfigError, MissingDataError, Qs3Error
-from qs3.utils.files import sha256_file
+from qs3.errors import ConfigError, Qs3Error
+from qs3.utils.files import reading, sha256_file
 from qs3.utils.settings import problems
 
 # Keys that do not change a result: where things lie, what is shown, how data would be made, and the
@@ -228,11 +228,9 @@ def with_values(cfg: DictConfig, keys: Sequence[str]) -> Any:
 
 
 def file_sha256(file: str) -> str:
-    """Hash of a file that the config names; MissingDataError if it cannot be read."""
-    try:
+    """Hash of a file that the config names."""
+    with reading(file):
         return sha256_file(Path(file).expanduser())
-    except OSError as error:
-        raise MissingDataError(f"{file} cannot be read ({error})") from error
 
 
 def _leave_out(plain: Any, key: str) -> None:

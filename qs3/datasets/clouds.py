@@ -107,8 +107,7 @@ def check_shape(where: Any, shape: tuple[int, ...]) -> None:
     rows, columns = shape[-2:] if len(shape) in (2, 3) else (0, 0)
     if not 3 <= columns <= _MOST_COLUMNS or (rows == 3 and columns > _FEW):
         raise DataError(
-            f"{where}: shape {shape}, expected points as rows, [n, 3] or [m, n, 3]; a depth image "
-            "goes to depth="
+            f"{where}: shape {shape}, not rows of points [n, 3] or [m, n, 3]; see depth="
         )
 
 
@@ -145,10 +144,7 @@ def checked(cloud: np.ndarray, where: str) -> Float[np.ndarray, "n 3"]:
     if extent == 0 or not coarse.any():
         return small
     if coarse[2] or cloud.dtype in (np.float32, np.float16):  # the digits are lost
-        raise DataError(
-            f"{where}: its coordinates, up to {np.abs(small).max():.7g}, are too large for the "
-            f"digits of float32, and the cloud is only {extent:.3g} large; subtract an offset"
-        )
+        raise DataError(f"{where}: float32 is too coarse for its coordinates; subtract an offset")
     moved: np.ndarray = np.asarray(cloud, np.float64) - np.where(coarse, (low + high) / 2, 0)
     return moved.astype(np.float32)
 
@@ -278,13 +274,16 @@ def _label(label: Any, classes: Sequence[str], where: Path) -> str:
     return class_of(str(label), classes, where)
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    """All files of known formats below a folder; links to folders are not followed."""
+def visible_files(folder: Path) -> Iterator[Path]:
+    """All files below a folder that are not hidden; links to folders are not followed."""
     for path in folder.rglob("*"):
         below = path.relative_to(folder).parts
-        hidden = any(part.startswith(".") or part == "__MACOSX" for part in below)
-        if path.suffix.lower() in SUFFIXES and not hidden and path.is_file():
+        if not any(part.startswith((".", "__MACOSX")) for part in below) and path.is_file():
             yield path
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in visible_files(folder) if path.suffix.lower() in SUFFIXES)
 
 
 def _text(path: Path) -> CloudFile:

@@ -107,9 +107,7 @@ class Domain:
         if scale in HEIGHTS and self.floor_m is None:
             lacks = lacks or "floor_m"
         if lacks:
-            raise ConfigError(
-                f"data.scale={scale}: set {lacks} of domain {self.name}, if it is known"
-            )
+            raise ConfigError(f"data.scale={scale}: set {lacks} of domain {self.name}")
 
     def check(self) -> Importer | None:
         """Find out, in milliseconds, whether `open` has something to open; returns `importer()`.
@@ -123,9 +121,8 @@ class Domain:
         if is_finished(self.folder):
             if importer and there and "imported" not in read_meta(self.folder):
                 raise DataError(
-                    f"domain {self.name}: there are two datasets, one that was made here in "
-                    f"{self.folder} and the published files in {importer.root}: move one away, or "
-                    "set published=null"
+                    f"domain {self.name}: there are two datasets, {self.folder}, which was made "
+                    f"here, and {importer.root}: move one away, or set published=null"
                 )
         elif not there:
             looked = [self.folder / "meta.yaml"]
@@ -168,8 +165,7 @@ class Domain:
         importer = self.importer()
         if importer is not None and importer.is_there():
             raise DataError(
-                f"domain {self.name}: its published files are in {importer.root}; give another "
-                "paths.data_dir, or domain.published=null"
+                f"{importer.root} holds published files of {self.name}; see domain.published=null"
             )
 
     def made_of(self, dataset: PointSet) -> MadeOf:
@@ -202,10 +198,7 @@ class Domain:
         changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
         if changed:
             was, wanted = ({key: of.get(key) for key in changed} for of in (imported, now))
-            raise DataError(
-                f"{self.folder} was imported with {was}, and now it is {wanted}: delete it to "
-                "import it again, or give another `path`"
-            )
+            raise DataError(f"{self.folder} was imported with {was}, now it is {wanted}: delete it")
 
 
 def check_or_make(source: Domain, target: Domain, make_source: bool) -> None:

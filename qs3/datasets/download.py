@@ -138,10 +138,7 @@ def fetch(source: Source, path: Path) -> Path:
     try:
         pooch.retrieve(source.page, None, path.name, path.parent, downloader=downloader)
     except (requests.RequestException, ValueError) as error:
-        raise Qs3Error(
-            f"{source.page}: {error}. Run the same command again, or open it in a browser and give "
-            "the file with archive=PATH"
-        ) from error
+        raise Qs3Error(f"{source.page}: {error}; or fetch it by hand for archive=PATH") from error
     return path
 
 
@@ -173,8 +170,7 @@ def find_folder(archive: Path, files: Iterable[str], part: Part) -> str:
     large = sorted(root for root, count in roots.items() if count >= part.of_layout("at_least"))
     if len(large) != 1:
         raise DataError(
-            f"{archive}: folders of {part.of_layout('says')}: {', '.join(large) or 'none'}, of "
-            f"{sorted({file.rpartition('/')[0] for file in files})[:12]}; unpack "
+            f"{archive}: folders of {part.of_layout('says')}: {', '.join(large) or 'none'}; unpack "
             "the wanted one by hand"
         )
     return large[0].rstrip("/")

@@ -178,8 +178,7 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
             return
         if is_begun(folder):
             raise DataError(
-                f"{folder} holds a generation that was not finished, and {importer.root} holds "
-                "published files: finish the generation, or delete the folder"
+                f"{folder} holds an unfinished generation: finish it, or delete the folder"
             )
         shutil.rmtree(building, ignore_errors=True)
         work = folder.with_name(f".{folder.name}.parts")

@@ -67,11 +67,8 @@ class Joined(Importer):
         for name, folder in zip(self.datasets, self.stores, strict=True):
             data = open_pointset(folder)
             if data.classes != tuple(classes) or self.stores.count(folder) > 1:
-                raise DataError(
-                    f"{folder} has the classes {', '.join(data.classes)}, not "
-                    f"{', '.join(classes)}, or stands twice in published.datasets"
-                )
-            kept = (row for row in read_manifest(folder, data.classes) if row.status == OK)
+                raise DataError(f"{folder} has other classes, or comes twice in published.datasets")
+            kept = (row for row in read_manifest(folder) if row.status == OK)
             for i, row in enumerate(kept):
                 object_ = FURTHER_SCAN.sub("", row.id)
                 number = scans[object_]

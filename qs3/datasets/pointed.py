@@ -181,9 +181,7 @@ def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, i
     rows = max(int(np.floor(top)), 0), min(int(np.ceil(bottom)), height)
     columns = max(int(np.floor(left)), 0), min(int(np.ceil(right)), width)
     if rows[0] >= rows[1] or columns[0] >= columns[1] or max(right, bottom) <= 1:
-        raise DataError(
-            f"box={list(box)} is not left,top,right,bottom in pixels of {width} x {height}"
-        )
+        raise DataError(f"box={list(box)} is not left,top,right,bottom in {width} x {height} px")
     return *rows, *columns
 
 

@@ -129,7 +129,5 @@ def _classes(
     names = given if given is not None else getattr(dataset, "classes", None)
     found = [] if names is None and known else list(class_list(names))
     if len(set(found)) < len(found) or (known and not 0 <= min(known) <= max(known) < len(found)):
-        raise ConfigError(
-            f"classes={found}: expected a name for each y, {min(known)} to {max(known)}"
-        )
+        raise ConfigError(f"classes={found}: expected a name for each y, of {sorted({*known})}")
     return found

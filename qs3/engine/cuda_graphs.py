@@ -211,10 +211,7 @@ class _Copied(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         if ctx.done or ctx.turn != ctx.graph.replays:
-            raise RuntimeError(
-                "a pass that is replayed as a CUDA graph goes back once, in its own step: set "
-                "trainer.cuda_graphs=false for a loss that asks for more"
-            )
+            raise RuntimeError("a replayed pass goes back once: set trainer.cuda_graphs=false")
         ctx.done = True
         return None, *grads
 

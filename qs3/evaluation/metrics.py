@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.datamodules.clouds import Clouds
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.kernels.norms import use_trained
 from qs3.runs.metrics import PseudoLabelScores, Scores
 from qs3.runs.predictions import Predictions, read_pseudo_labels
@@ -43,8 +43,6 @@ def global_features(
     domain: str = "target",
 ) -> Float[np.ndarray, "n d"]:
     """The backbone's features of each cloud, float64, as `outputs_of`."""
-    if not hasattr(net, "features"):
-        raise ConfigError(f"{type(net).__name__} has no features; choose e.g. model=dgcnn")
     features = outputs_of(
         net, lambda x: (net.features(x).global_,), points, batch_size, device, domain=domain
     )

@@ -3,9 +3,8 @@
 import re
 
 import numpy as np
+import scipy  # imports its parts when they are used
 from jaxtyping import Float
-
-OBJECTIVE = "infomax"
 
 
 def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
@@ -19,13 +18,8 @@ def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
     it is called IM.
     """
     mean = probabilities.mean(axis=0, keepdims=True)
-    return float(np.maximum(0.0, _entropy(mean) - _entropy(probabilities)))  # max() loses NaN
-
-
-def _entropy(probabilities: Float[np.ndarray, "n k"]) -> float:
-    from scipy.special import entr  # late: train.py imports this module before it knows its data
-
-    return float(entr(probabilities).sum(axis=1).mean())
+    of_mean, of_each = (scipy.special.entr(p).sum(axis=1).mean() for p in (mean, probabilities))
+    return float(np.maximum(0.0, of_mean - of_each))  # max() loses NaN
 
 
 def chosen_in_words(chosen: str) -> str:

@@ -29,7 +29,6 @@ from qs3.evaluation.validators import chosen_in_words
 from qs3.inference.model_file import (
     CARD,
     CONFIG,
-    EXPORTED,
     PACKAGES,
     WEIGHTS,
     Result,
@@ -46,6 +45,7 @@ from qs3.utils.files import atomic_path, make_folder
 from qs3.utils.page import render
 from qs3.utils.version import VERSION
 
+EXPORTED = (".onnx", ".pt2")
 ALLOWED = 1e-4  # difference of logits
 INPUT, OUTPUT = "points", "logits"
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20

@@ -6,7 +6,6 @@ the others go on.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
-from qs3.datasets.clouds import SUFFIXES, CloudFile, parse_clouds, with_depth
+from qs3.datasets.clouds import SUFFIXES, CloudFile, parse_clouds, visible_files, with_depth
 from qs3.datasets.cutting import Fault
 from qs3.datasets.depth_images import (
     Intrinsics,
@@ -121,14 +120,7 @@ def find_files(
     """
     if place.is_file():
         return [place], place.parent, Counter()
-    there: list[Path] = []
-
-    def stop(error: OSError) -> None:  # `os.walk` would leave out a folder that cannot be read
-        raise MissingDataError(f"{error.filename} cannot be read ({error.strerror})") from error
-
-    for folder, folders, names in os.walk(place, onerror=stop):
-        folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
-        there += [Path(folder, name) for name in names if not name.startswith(".")]
+    there = [*visible_files(place)]
     found = sorted(path for path in there if path.suffix.lower() in suffixes)
     if not found:
         raise MissingDataError(f"{place} holds no file of {' '.join(suffixes)}")

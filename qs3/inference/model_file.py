@@ -26,22 +26,18 @@ import safetensors.torch
 import torch
 from annotated_types import Ge, Gt, Len
 from jaxtyping import Float
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.unlabelled import HeldOut
 from qs3.runs.checkpoints import load, save
 from qs3.utils.files import atomic_path, make_folder, reading, sha256_file, write_json, write_text
-from qs3.utils.settings import problems
 from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
 
 FILE = "result.pt"
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
-EXPORTED = (".onnx", ".pt2")
-"""What `qs3 export` writes for other programs."""
-
 PACKAGES = ("qs3.models",)
 """Packages that a file may take its net from."""
 
@@ -151,14 +147,11 @@ def find_result(path: str | Path) -> Path:
     if str(path) in pretrained_names() and not Path(path).exists():
         path = PRETRAINED / path
     path = Path(path).expanduser()
-    if path.suffix.lower() in EXPORTED:
-        raise ConfigError(f"{path} lacks what prepares its clouds; give what it was exported from")
     for file in (path, path / FILE, path / WEIGHTS):
         if file.is_file():
             return file
     raise MissingDataError(
-        f"{path} is not a finished run, and has no {FILE}; give its folder, or one of "
-        f"{', '.join(pretrained_names())}"
+        f"{path} is not a finished run, nor one of {', '.join(pretrained_names())}"
     )
 
 
@@ -166,7 +159,7 @@ def read_result(path: str | Path) -> Result:
     """Read and check what `write_result` or `write_folder` wrote; nothing in it is run."""
     file = find_result(path)
     if file.name != WEIGHTS:
-        return _checked(file, load(file, advice="copy it again, or repeat its run"))
+        return _checked(file, load(file))
     config = file.with_name(CONFIG)
     with reading(config):
         values, data = json.loads(config.read_bytes()), file.read_bytes()
@@ -210,17 +203,11 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
         except ImportError as error:
             why = str(error)
     if not callable(make) or getattr(make, "__module__", None) != module:
-        raise DataError(
-            f"the file's model {target} is refused: {why}; name the package of a net of your own, "
-            "packages="
-        )
+        raise DataError(f"the file's model {target} is refused: {why}; see packages=")
     return make
 
 
 def _checked(file: Path, found: Any) -> Result:
     """The file's values as a `Result`."""
     with reading(file):
-        try:
-            return _RESULT.validate_python({k: found[k] for k in found if k != "qs3"})
-        except ValidationError as error:
-            raise ValueError(problems(error)) from error
+        return _RESULT.validate_python({k: found[k] for k in found if k != "qs3"})

@@ -130,8 +130,7 @@ class Predictor:
         if given is None and self.needs_floor and self.camera_height is None:
             raise ConfigError(
                 "the classifier knows heights above the floor: give floor=Z, 0 if objects stand on "
-                "z = 0, or camera_height=METRES, which is floor=-METRES where the camera is the "
-                "origin"
+                "z = 0, or camera_height=METRES where the camera is the origin"
             )
         if given is not None and not abs(given) < HIGHEST_M:
             raise ConfigError(f"floor={given:g} is not where a floor is in metres")
@@ -181,8 +180,6 @@ class Predictor:
             DataError: names the cloud that is empty or not finite.
             ConfigError: `floor` is needed.
         """
-        if getattr(clouds, "ndim", 3) == 2:
-            raise DataError("got one cloud; give a list of them, predictor([cloud])")
         arrays = list(clouds)
         if not arrays:
             return np.empty((0, len(self.classes)))

@@ -12,8 +12,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from qs3.errors import ConfigError, MissingDataError
+from qs3.errors import ConfigError
 from qs3.methods.base import Method
+from qs3.utils.files import reading
 
 
 def own(file: str, sha256: str, **settings: Any) -> Method:
@@ -30,10 +31,8 @@ def own(file: str, sha256: str, **settings: Any) -> Method:
             labels of the target.
     """
     path = Path(file).expanduser()
-    try:
+    with reading(path):
         source = path.read_bytes()
-    except OSError as error:
-        raise MissingDataError(f"method.file={file} cannot be read ({error})") from error
     if hashlib.sha256(source).hexdigest() != sha256:
         raise ConfigError(f"method.file={file} has changed since this run was asked for")
     module = _imported(path, source, sha256)

@@ -29,6 +29,7 @@ from qs3.models.base import Backbone, Features, PointClassifier, with_head
 from qs3.utils.settings import checked
 
 Variant = Literal["uda", "simpleview", "defrec"]
+SLOPE = 0.2  # of LeakyReLU
 
 
 class EdgeConv(nn.Module):
@@ -40,19 +41,10 @@ class EdgeConv(nn.Module):
         in_channels, out_channels: Cin, Cout.
         norm: see `qs3.kernels.norms`; "batch" is over all edges of the batch, "instance" over the
             edges of each cloud, in eval too.
-        negative_slope: of LeakyReLU.
     """
 
-    def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        *,
-        norm: Norm = "batch",
-        negative_slope: float = 0.2,
-    ) -> None:
+    def __init__(self, in_channels: int, out_channels: int, *, norm: Norm = "batch") -> None:
         super().__init__()
-        self.negative_slope = negative_slope
         self.linear = nn.Linear(2 * in_channels, out_channels, bias=False)
         self.norm = make_norm(norm, out_channels)
 
@@ -64,9 +56,9 @@ class EdgeConv(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             x = x.to(weight.dtype)
             if fast.usable(x, anywhere=True, traceable=not uses_batch(self.norm)):
-                return edge_conv(x, index, weight, self.norm, self.negative_slope)
+                return edge_conv(x, index, weight, self.norm, SLOPE)
             z = normed(self.norm, self.linear(edges_of(x, index)))  # [b, n, k, d]
-            return max_over_members(F.leaky_relu(z, self.negative_slope))
+            return max_over_members(F.leaky_relu(z, SLOPE))
 
 
 def edges_of(x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n k 2*c"]:
@@ -88,7 +80,7 @@ class EdgeTNet(nn.Module):
 
         def layer(wide: int, narrow: int, bias: bool = False) -> list[nn.Module]:
             linear = nn.Linear(wide, narrow, bias=bias)
-            return [linear, make_norm(kind, narrow), nn.LeakyReLU(0.2)]
+            return [linear, make_norm(kind, narrow), nn.LeakyReLU(SLOPE)]
 
         self.edges = nn.Sequential(*layer(6, 64), *layer(64, 128))
         self.points = nn.Sequential(*layer(128, 1024))
@@ -154,7 +146,7 @@ class DGCNN(Backbone):
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
         y = linear(per_point, self.conv5.weight)  # [B, N, 1024]
         if self.norm5 is not None:
-            y = F.leaky_relu(normed(self.norm5, y), 0.2)
+            y = F.leaky_relu(normed(self.norm5, y), SLOPE)
         most, _ = max_over_rows(y) if fast.usable(x) else y.max(1)
         if self.variant == "defrec":
             return Features(most, per_point)

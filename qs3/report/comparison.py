@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from qs3.datasets.object_archive import TIERS
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError, Qs3Error
 from qs3.report.formats import marks
 from qs3.report.intervals import LEVEL, Interval, difference
 from qs3.report.results import CLOUDS, MESHES, answers_of, data_lines, same_data
@@ -103,7 +103,7 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
         why = f"the runs saw different targets: {' and '.join(dict.fromkeys(seen))}"
     try:
         return Compared(name, why=why) if why else _difference(name, cells, seeds)
-    except DataError as error:
+    except Qs3Error as error:
         return Compared(name, why=str(error))
 
 

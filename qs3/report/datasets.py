@@ -52,13 +52,13 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
     data = open_pointset(folder, variant)
     more = [variant] * (variant != "points") + ["simulated"] * bool(data.meta.get("simulated"))
     label = f"{data.name} ({', '.join(more)})" if more else data.name
-    rows = tuple(read_manifest(folder, data.classes))
+    rows = tuple(read_manifest(folder))
     return Opened(data.name, label, folder, variant, data, rows, data.made_of)
 
 
 def opened_domain(domain: Domain, data: PointSet) -> Opened:
     """A domain whose dataset is open."""
-    rows = tuple(read_manifest(domain.folder, data.classes))
+    rows = tuple(read_manifest(domain.folder))
     where = (domain.name, domain.label, domain.folder, domain.variant)
     return Opened(*where, data, rows, domain.made_of(data), "m" * (domain.unit == "metres"))
 

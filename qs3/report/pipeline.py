@@ -4,30 +4,30 @@ Images are of one view; clouds are all views together, seen from the side of the
 are those that `generate.py` makes of the object or room.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
+from qs3.config.compose import composed
+from qs3.config.hydra import build
 from qs3.generation.kept import Keep, view_images
 from qs3.generation.plan import planned
 from qs3.generation.rooms import Rooms
+from qs3.generation.scan import Scanner
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import Up, load_mesh
 from qs3.meshes.mesh import Mesh, MeshItem
 from qs3.sensors.base import DepthFrame
 from qs3.utils.pictures import AZIMUTH_DEG, Image, cloud_image, sheet, turn_deg, value_image
 from qs3.utils.seeding import object_rng
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _OFTEN_THERE = "chair/train/chair_0000"
 _ASIDE_DEG = 40.0  # of the camera, so that errors of depth are seen
@@ -102,10 +102,6 @@ def scan_object(
         object_id: which object; None: a chair, or the first there is.
         mesh: a mesh file to scan in place of the domain's objects.
     """
-    from qs3.config.compose import composed
-    from qs3.config.hydra import build
-    from qs3.generation.scan import Scanner
-
     cfg = composed("generate", *overrides)
     scanner = Scanner(cfg)
     recipe = scanner.recipe
@@ -132,8 +128,6 @@ def scan_object(
 
 def makes_rooms(overrides: Sequence[str]) -> bool:
     """Whether a domain's recipe furnishes rooms."""
-    from qs3.config.compose import composed
-
     return isinstance(planned(composed("generate", *overrides)).recipe, Rooms)
 
 
@@ -144,12 +138,6 @@ def room_figure(overrides: Sequence[str], room: str | None = None) -> Figure:
         overrides: of generate.py, such as ["domain=rooms10"].
         room: its id; None: the first of the domain's.
     """
-    from matplotlib import colormaps
-
-    from qs3.config.compose import composed
-    from qs3.config.hydra import build
-    from qs3.generation.scan import Scanner
-
     cfg = composed("generate", *overrides)
     item = next(one for one in planned(cfg).tasks if room in (None, one.id))
     frames: list[DepthFrame] = []
@@ -191,8 +179,6 @@ def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
 
 def cloud_images(one: ScannedObject) -> list[Picture]:
     """The cloud, its clean twin and its residuals, with their titles."""
-    from matplotlib import colormaps
-
     azimuth = AZIMUTH_DEG
     if one.views:
         away = -one.views[0].world_from_camera[:3, 2]  # from the object to the first camera

@@ -35,7 +35,7 @@ from qs3.datasets.object_archive import TIERS
 from qs3.errors import DataError
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics
 from qs3.runs.predictions import FILE, read_predictions
-from qs3.utils.files import write_bytes
+from qs3.utils.files import reading, write_bytes
 from qs3.utils.text_table import aligned
 
 FEW_SEEDS = 3
@@ -135,7 +135,7 @@ def write_kept(path: Path, lines: pd.DataFrame) -> None:
 def read_kept(path: str | Path, target: str | None = None) -> dict[tuple[str, str], pd.DataFrame]:
     """Read a kept file: the lines of each row and column; only those on a target if it is given."""
     numbers: dict[str, type] = {**dict.fromkeys((*SCORES, *_COSTS), float), "seed": int}
-    try:
+    with reading(path):
         lines = pd.read_csv(
             path,
             dtype=defaultdict[str, type](lambda: str, numbers),
@@ -146,8 +146,6 @@ def read_kept(path: str | Path, target: str | None = None) -> dict[tuple[str, st
         lines = lines.assign(**{name: lines[name].astype(str) == "True" for name in _FLAGS})
         lines = lines if target is None else lines[lines.target == target]
         return dict(iter(lines.groupby(["row", "column"], sort=False)))
-    except (OSError, ValueError, KeyError, AttributeError) as error:
-        raise DataError(f"{path} cannot be read ({error})") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,6 @@ What an unfinished run does not have is None. A chart that has nothing to show i
 page gives the reason. Labels of the target judge a finished run; nothing is chosen by them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import logging
 import shlex
@@ -13,13 +11,16 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 
 from qs3.config.hydra import in_multirun
 from qs3.datasets.domain import Domain
-from qs3.errors import DataError, MissingDataError, Qs3Error
+from qs3.errors import MissingDataError, Qs3Error
 from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.inference.page import confusion_rows
@@ -31,13 +32,9 @@ from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.store.meta import is_finished
 from qs3.store.store import PointSet
-from qs3.utils.files import make_folder, write_text
+from qs3.utils.files import make_folder, reading, write_text
 from qs3.utils.page import render
 from qs3.utils.pictures import BLUE, GREEN, GRID, ORANGE, RED, SOFT, blank, save_png
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
@@ -77,10 +74,6 @@ def is_run(folder: Path) -> bool:
 
 def read_run(folder: str | Path) -> RunFiles:
     """Read a run's folder."""
-    import pandas as pd
-    import yaml
-    from omegaconf import OmegaConf
-
     folder = Path(folder).expanduser()
     if not is_run(folder):
         raise MissingDataError(f"{folder} is not the folder of a run")
@@ -89,15 +82,13 @@ def read_run(folder: str | Path) -> RunFiles:
         predictions = read_predictions(folder / PREDICTIONS)
     classes = tuple(metrics.final.predicted) if metrics else ()
     hydra: dict[str, Any] = {"config": None, "overrides": ()}
-    try:
+    with reading(f"{folder}: {HISTORY} or .hydra"):
         if (folder / HISTORY).is_file():
             history = pd.read_csv(folder / HISTORY)
             history = history if len(history) else None
         for name in hydra:
             if (path := folder / ".hydra" / f"{name}.yaml").is_file():
                 hydra[name] = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
-    except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
-        raise DataError(f"{folder}: {HISTORY} or .hydra is damaged ({error})") from error
     command = shlex.join(["python", "train.py", *map(str, hydra["overrides"])])
     return RunFiles(folder, metrics, history, predictions, classes, hydra["config"], command)
 
@@ -107,10 +98,6 @@ def _target_of(run: RunFiles, data_dir: str | Path | None) -> tuple[Domain, Poin
 
     Nothing is imported or made.
     """
-    from omegaconf import OmegaConf
-
-    import qs3.config.hydra  # noqa: F401 (registers the resolvers of a config)
-
     if run.config is None:
         raise MissingDataError(f"{run.folder} has no .hydra/config.yaml that names its data")
     cfg = OmegaConf.create(dict(run.config))
@@ -124,9 +111,7 @@ def _target_of(run: RunFiles, data_dir: str | Path | None) -> tuple[Domain, Poin
         raise MissingDataError(f"the run's target, {domain.name}, is not at {domain.folder}")
     data = domain.open(verify=False)
     if data.sha256 != run.metrics.data.target:
-        raise MissingDataError(
-            f"{domain.folder} holds another version of {domain.name} than the run used"
-        )
+        raise MissingDataError(f"{domain.folder} is not the {domain.name} that the run used")
     return domain, data
 
 
@@ -153,8 +138,6 @@ def draw(
         data_dir: where the datasets lie; None: where the run's config says.
         config: of the run; None: what Hydra wrote into its folder.
     """
-    from omegaconf import OmegaConf
-
     run = read_run(folder)
     if config is not None:
         run = dataclasses.replace(run, config=config)
@@ -244,8 +227,6 @@ def pseudo_labels(rounds: Sequence[RoundRecord], classes: Sequence[str]) -> pd.D
 
     And what they are worth: precision and recall know the target's labels, which judge alone.
     """
-    import pandas as pd
-
     columns = {}
     for one in rounds:
         kept, by_class = ("thresholds", one.thresholds) if one.mu is None else ("mu", one.mu)

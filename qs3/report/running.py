@@ -120,10 +120,7 @@ def check_row(table: Table, name: str) -> None:
     """Check that all rows follow the leaderboard's rules, and the file (`qs3.methods.own`)."""
     for row, cells in table.rows.items():
         if row != name and any(c.overrides and ALONE not in c.overrides for c in cells):
-            raise ConfigError(
-                f"table={table.name}: its row {row!r} is not of {ALONE}, so it has other steps or "
-                "points than yours would have"
-            )
+            raise ConfigError(f"table={table.name}: its row {row!r} is not of {ALONE}")
     _, cfg = composed_of(next(cell for cell in table.rows[name] if cell.overrides))
     build(cfg.method)
 

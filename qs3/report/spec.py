@@ -21,6 +21,7 @@ from pydantic.dataclasses import dataclass
 
 from qs3.config.location import CONF
 from qs3.errors import ConfigError
+from qs3.utils.files import reading
 
 _STRICT = ConfigDict(extra="forbid")
 _Percent = Annotated[float, Interval(ge=0, le=100)]
@@ -109,7 +110,7 @@ def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[s
     `name` is of a file in conf/table, or the path of one's own, NAME.yaml.
     """
     path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
-    try:
+    with reading(path):
         plain = yaml.safe_load(path.read_text(encoding="utf-8"))
         columns = plain["columns"]
         columns = dict.fromkeys(columns, "") if isinstance(columns, list) else columns
@@ -120,8 +121,6 @@ def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[s
         spec = TypeAdapter(Spec).validate_python(plain)
         if twice := [name for name, n in Counter(r.name for r in spec.rows).items() if n > 1]:
             raise ValueError(f"two rows are called {twice[0]!r}")
-    except (OSError, yaml.YAMLError, TypeError, KeyError, ValueError, AttributeError) as error:
-        raise ConfigError(f"{path}: missing or wrong entry: {error}") from error
     return path.stem, spec
 
 

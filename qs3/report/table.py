@@ -16,8 +16,9 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from qs3.config.compose import composed, override
+from qs3.config.hydra import config_hash
 from qs3.config.location import typed
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError, Qs3Error
 from qs3.report.results import (
     NO_RUNS,
     Runs,
@@ -211,8 +212,6 @@ def composed_of(cell: Cell) -> tuple[tuple[str, str], DictConfig]:
 
 @functools.lru_cache(maxsize=4096)
 def _composed(words: tuple[str, ...], place: str) -> tuple[tuple[str, str], DictConfig]:
-    from qs3.config.hydra import config_hash
-
     cfg = composed("train", *words, place=place)
     return (str(cfg.experiment_name), config_hash(cfg)), cfg
 
@@ -226,7 +225,7 @@ def kept_lines(table: Table) -> pd.DataFrame:
     for run in lines.to_dict("records"):
         try:
             found.append(answers_of(run).as_text if run["take"] == "final" else {})
-        except DataError:  # a run without predictions
+        except Qs3Error:  # a run without predictions
             found.append({})
     answers = pd.DataFrame(found)
     known = lines.drop(columns=["folder", "problem", *answers.columns], errors="ignore")

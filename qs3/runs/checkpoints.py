@@ -5,45 +5,40 @@ with a checksum (CRC-32) of each tensor and never looks at it, so that a flipped
 another weight; here it is compared whenever a file is read.
 """
 
-import contextlib
 import hashlib
+import io
 import os
 import zipfile
-from collections.abc import Iterator, Mapping
-from typing import Any, BinaryIO
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import nn
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
-from qs3.errors import ConfigError, DataError
-from qs3.utils.files import atomic_path
+from qs3.errors import ConfigError
+from qs3.utils.files import reading, write_bytes
 
 LAST = "last.ckpt"
 
 
 def save(value: Any, path: str | os.PathLike[str]) -> None:
     """Save tensors and plain values to `path`, atomically; others, such as numpy's, are refused."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        try:
-            torch.save(value, file)
-        except RuntimeError as error:  # torch complains of the half file, not of what broke it off
-            if isinstance(error.__context__, OSError | KeyboardInterrupt | SystemExit):
-                raise error.__context__ from error
-            raise
-        file.flush()
-        if kinds := get_unsafe_globals_in_checkpoint(temporary):
-            raise ConfigError(
-                f"{path} would hold {', '.join(kinds)} and could not be read again: keep tensors "
-                "and plain values alone, with float(...) for instance"
-            )
+    file = io.BytesIO()  # of a file that a full disk breaks off torch complains in its own words
+    torch.save(value, file)
+    file.seek(0)
+    if kinds := get_unsafe_globals_in_checkpoint(file):
+        raise ConfigError(f"{path} could not be read again: keep no {', '.join(kinds)} in it")
+    write_bytes(path, file.getvalue())
 
 
-def load(
-    path: str | os.PathLike[str], device: Any = "cpu", advice: str = "start again with force=true"
-) -> Any:
-    """Read what `save` wrote; the disk is read once. A DataError ends with the advice."""
-    with _intact(path, advice) as file:
+def load(path: str | os.PathLike[str], device: Any = "cpu") -> Any:
+    """Read what `save` wrote, after every checksum was compared."""
+    with reading(path), open(path, "rb") as file:
+        with zipfile.ZipFile(file) as archive:
+            if (damaged := archive.testzip()) is not None:
+                raise zipfile.BadZipFile(f"the checksum of {damaged} does not match")
+        file.seek(0)
         return torch.load(file, map_location=device, weights_only=True)
 
 
@@ -59,18 +54,3 @@ def weights_sha256(weights: Mapping[str, torch.Tensor]) -> str:
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
         digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-@contextlib.contextmanager
-def _intact(path: str | os.PathLike[str], advice: str) -> Iterator[BinaryIO]:
-    """The open file, after every checksum was compared; all that is raised becomes a DataError."""
-    try:
-        with open(path, "rb") as file:
-            with zipfile.ZipFile(file) as archive:
-                if (damaged := archive.testzip()) is not None:
-                    raise zipfile.BadZipFile(f"the checksum of {damaged} does not match")
-            file.seek(0)
-            yield file
-    except Exception as error:  # zipfile and torch raise many kinds for a damaged file
-        why = ": ".join([type(error).__name__, *str(error).splitlines()[:1]])
-        raise DataError(f"{path} cannot be read ({why}); {advice}") from error

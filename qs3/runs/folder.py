@@ -26,7 +26,7 @@ from typing import Any
 
 from qs3.errors import ConfigError, DataError
 from qs3.runs.metrics import METRICS
-from qs3.utils.files import write_json
+from qs3.utils.files import reading, write_json
 
 STARTED = "started.json"
 _ANEW = "choose another experiment_name, or start again with force=true"
@@ -37,12 +37,10 @@ _KEPT_WHEN_CLEARED = (".hydra", ".lock")
 def read_started(folder: str | Path) -> dict[str, Any] | None:
     """What `write_started` saved; None if the run never got that far."""
     path = Path(folder) / STARTED
-    try:
-        return dict(json.loads(path.read_bytes()))
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise DataError(f"{path} cannot be read ({error}); run with force=true") from error
+    with reading(path):
+        return dict(json.loads(path.read_bytes()))
 
 
 def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:
@@ -62,10 +60,7 @@ def check_data(folder: Path, domain: str, expected: str, found: str) -> None:
 def check_config(folder: Path, expected: str | None, found: str) -> None:
     """Raise ConfigError rather than continue, or reuse, the run of another config."""
     if found != expected:
-        raise ConfigError(
-            f"{folder} holds a run with other settings (config hash {expected}, now {found}; they "
-            f"are in .hydra/config.yaml); {_ANEW}"
-        )
+        raise ConfigError(f"{folder} has other settings, see its .hydra/config.yaml; {_ANEW}")
 
 
 def clear(folder: str | Path) -> None:

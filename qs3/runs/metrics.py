@@ -8,13 +8,11 @@ from dataclasses import field
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from qs3.errors import DataError
 from qs3.store.meta import MadeOf
-from qs3.utils.files import write_text
-from qs3.utils.settings import problems
+from qs3.utils.files import reading, write_text
 
 METRICS = "metrics.json"
 
@@ -247,13 +245,10 @@ _SCHEMA: TypeAdapter[RunMetrics] = TypeAdapter(RunMetrics)
 def read_metrics(folder: str | Path) -> RunMetrics | None:
     """The result of a finished run; None if the run is not finished."""
     path = Path(folder) / METRICS
-    try:
-        return _SCHEMA.validate_json(path.read_bytes())
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValidationError) as error:
-        why = error if isinstance(error, OSError) else problems(error)
-        raise DataError(f"{path} is damaged ({why}); delete it and repeat the command") from error
+    with reading(path):
+        return _SCHEMA.validate_json(path.read_bytes())
 
 
 def write_metrics(folder: str | Path, metrics: RunMetrics) -> None:

@@ -11,8 +11,7 @@ round_03/pseudo_labels.csv, of a round's target clouds: id, label, confidence, s
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,8 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.errors import DataError
-from qs3.utils.files import write_text
+from qs3.utils.files import reading, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,7 +85,7 @@ def write_predictions_of_files(
 
 def read_predictions(path: Path) -> Predictions:
     """Read the table; it is checked as a whole."""
-    with _named(path):
+    with reading(path):
         table = _read(path)
         chances = table.filter(regex="^p_")
         classes = tuple(name.removeprefix("p_") for name in chances)
@@ -126,7 +124,7 @@ def write_pseudo_labels(
 
 def read_pseudo_labels(path: Path) -> pd.DataFrame:
     """Read the table: id, label (the predicted class's name), confidence, selected (a bool)."""
-    with _named(path):
+    with reading(path):
         table = _read(path)
         kept = [{"0": False, "1": True}[word] for word in table.selected]
         return table.assign(confidence=table.confidence.astype(float), selected=kept)
@@ -150,12 +148,3 @@ def _read(path: Path) -> pd.DataFrame:
     if table.empty or table.isna().to_numpy().any():
         raise ValueError("rows are missing, or have different lengths")
     return table
-
-
-@contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Turn what a damaged file raises into a DataError that names it."""
-    try:
-        yield
-    except (OSError, ValueError, KeyError, IndexError, AttributeError) as error:
-        raise DataError(f"{path} is damaged ({error}); repeat the run with force=true") from error

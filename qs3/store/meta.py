@@ -12,6 +12,7 @@ import hashlib
 import io
 import itertools
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +20,8 @@ from typing import Any, ClassVar
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
-from qs3.errors import DataError, MissingDataError
-from qs3.utils.files import write_text
+from qs3.errors import DataError
+from qs3.utils.files import reading, write_text
 from qs3.utils.text_table import csv_text
 
 META = "meta.yaml"
@@ -117,12 +118,8 @@ def write_meta(folder: Path, facts: Mapping[str, Any], others: Mapping[str, Any]
 def read_meta(folder: str | Path) -> dict[str, Any]:
     """The contents of a finished dataset's meta.yaml, checked against its last line."""
     path = Path(folder) / META
-    try:
+    with reading(path):
         text = path.read_bytes().decode()
-    except FileNotFoundError as error:
-        raise MissingDataError(f"there is no finished dataset in {folder} (no {META})") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
     body, mark, checksum = text.rpartition(_CHECKSUM)
     if not mark or checksum != sha256_of(body) + "\n":
         raise DataError(f"{path} is damaged or was edited (its checksum is wrong); {AGAIN}")
@@ -179,22 +176,13 @@ _FIELDS = tuple("cls" if column == "class" else column for column in _COLUMNS)
 _INTEGERS = ("index", "seed", "views", "valid_points")
 
 
-def read_manifest(
-    folder: str | Path, classes: Sequence[str], sha256: str | None = None
-) -> list[ManifestRow]:
-    """All rows of a dataset's manifest.csv, failed ones included."""
-    path = Path(folder) / MANIFEST
-    try:
-        data = path.read_bytes()
-        rows = _from_csv(data.decode())
-    except (OSError, ValueError, csv.Error) as error:
-        raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
-    check_rows(rows, tuple(classes), where=str(path))
-    if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
-        raise DataError(
-            f"{path} is damaged or was edited (its SHA-256 is not the one in meta.yaml)"
-        )
-    return rows
+def read_manifest(folder: str | Path) -> list[ManifestRow]:
+    """All rows of a finished dataset's manifest.csv, failed ones included."""
+    path, known = Path(folder) / MANIFEST, read_meta(folder)["sha256"]["manifest"]
+    with reading(path):
+        text = path.read_bytes().decode()
+        assert sha256_of(text) == known, f"its SHA-256 is not the one in {META}; {AGAIN}"
+    return from_csv(text)
 
 
 def number(rows: Sequence[ManifestRow]) -> list[ManifestRow]:
@@ -205,28 +193,15 @@ def number(rows: Sequence[ManifestRow]) -> list[ManifestRow]:
     ]
 
 
-def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str) -> None:
-    """Raise DataError at the first row that contradicts the others or the classes."""
-    seen: dict[str, int] = {}
-    index = 0
+def check_rows(rows: Sequence[ManifestRow], classes: Sequence[str], name: str) -> None:
+    """Raise DataError unless all ids differ, and all classes and splits are known."""
     labelled = any(row.cls for row in rows)
-    for line, row in enumerate(rows, start=2):  # line 1 of the file is the header
-        ok, problem = row.status == OK, ""
-        unread = not ok and not row.cls  # its file did not even give the class
-        if not row.id or row.id in seen:
-            problem = f"the same id is already in line {seen[row.id]}" if row.id else "no id"
-        elif labelled and row.cls not in classes and not unread:
-            problem = f"unknown class {row.cls!r}; known are {', '.join(classes)}"
-        elif row.split not in SPLITS:
-            problem = f"unknown split {row.split!r}; known are {', '.join(SPLITS)}"
-        elif row.index != (index if ok else None):
-            problem = f"index is {row.index}, expected {index if ok else None}"
-        elif not ok and not row.reason:
-            problem = "an object that is not ok has a reason"
-        if problem:
-            raise DataError(f"{where}, line {line} (id {row.id!r}): {problem}")
-        seen[row.id] = line
-        index += ok
+    ids = Counter(row.id for row in rows)
+    for row in rows:
+        unread = row.status != OK and not row.cls  # its file did not even give the class
+        known = row.cls in classes or unread or not labelled
+        if ids[row.id] > 1 or not row.id or not known or row.split not in SPLITS:
+            raise DataError(f"dataset {name!r}: an id twice, or an unknown class or split: {row}")
 
 
 def to_csv(rows: Sequence[ManifestRow]) -> str:
@@ -240,19 +215,13 @@ def to_csv(rows: Sequence[ManifestRow]) -> str:
     return csv_text(lines)
 
 
-def _from_csv(text: str) -> list[ManifestRow]:
-    """The rows; ValueError or csv.Error if damaged, with the line."""
-    header, *lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-    more = header[len(_COLUMNS) :]
-    if tuple(header[: len(_COLUMNS)]) != _COLUMNS or len({*header}) < len(header):
-        raise ValueError("line 1: other columns")
-    rows = []
-    for line, values in enumerate(lines, start=2):
-        try:
-            fields: dict[str, Any] = dict(zip([*_FIELDS, *more], values, strict=True))
-            fields |= {name: int(fields[name]) if fields[name] else None for name in _INTEGERS}
-        except ValueError as error:
-            raise ValueError(f"line {line}: {error}") from error
+def from_csv(text: str) -> list[ManifestRow]:
+    """The rows that `to_csv` wrote."""
+    header, *lines = csv.reader(io.StringIO(text, newline=""))
+    more, rows = header[len(_COLUMNS) :], []
+    for values in lines:
+        fields: dict[str, Any] = dict(zip([*_FIELDS, *more], values, strict=True))
+        fields |= {name: int(fields[name]) if fields[name] else None for name in _INTEGERS}
         further = {key: value for key in more if (value := fields.pop(key))}
         rows.append(ManifestRow(**fields, more=further))
     return rows

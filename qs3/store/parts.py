@@ -11,7 +11,6 @@ The work is mostly a dataset, whose folder holds as well
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import platform
@@ -26,6 +25,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.store.meta import MadeOf, is_finished, read_meta
 from qs3.utils.files import (
     make_folder,
+    reading,
     remove_leftovers,
     sha256_file,
     write_bytes,
@@ -48,10 +48,8 @@ class PartFiles:
     def check(self, recipe: Mapping[str, Any]) -> None:
         """Compare with the recipe that is there."""
         path = self.folder / RECIPE
-        try:
+        with reading(path):
             there = json.loads(path.read_bytes())
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path} cannot be read ({error}); force=true starts over") from error
         if found := _differences(there, json.loads(json.dumps(recipe))):
             raise ConfigError(
                 f"{self.folder} was made with other settings, objects or versions:\n"
@@ -100,7 +98,7 @@ class PartFiles:
         An array is read, each time, when it is asked for; it raises then, too.
         """
         path = self._path(name)
-        with _opened(path) as file:
+        with reading(path), np.load(path, allow_pickle=False) as file:
             note = json.loads(file["note"].tobytes())
             return note, ArraysOnDisk(path, [key for key in file.files if key != "note"])
 
@@ -130,7 +128,7 @@ class ArraysOnDisk(Mapping[str, np.ndarray]):
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._names:
             raise KeyError(name)
-        with _opened(self._path) as file:
+        with reading(self._path), np.load(self._path, allow_pickle=False) as file:
             return np.asarray(file[name])
 
     def __iter__(self) -> Iterator[str]:
@@ -160,15 +158,6 @@ def delete_dataset(folder: Path) -> None:
     names = ("manifest.csv", CLOUDS, CONFIG)
     for path in [*(folder / name for name in names), *folder.glob("*.npy"), folder / RECIPE]:
         path.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            yield file
-    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-        raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
 
 
 def _differences(old: Any, new: Any, key: str = "") -> list[str]:

@@ -113,9 +113,7 @@ class PointSet:
         """The clouds of one split, in order; a view of the memmap if they are adjacent."""
         chosen = self.indices(split)
         if len(chosen) == 0:
-            raise DataError(
-                f"dataset {self.name!r} has no split {split!r}; it has {sorted(self.counts())}"
-            )
+            raise DataError(f"dataset {self.name!r} has no split {split!r}")
         adjacent = chosen[-1] - chosen[0] + 1 == len(chosen)
         return self.at(slice(int(chosen[0]), int(chosen[-1]) + 1) if adjacent else chosen)
 
@@ -197,7 +195,7 @@ def write_pointset(
     """
     folder = Path(folder)
     rows, classes, tables = number(rows), tuple(classes), dict(tables or {})
-    check_rows(rows, classes, where=f"rows of dataset {name!r}")
+    check_rows(rows, classes, name)
     clouds = sum(row.status == OK for row in rows)
     points = _shape(arrays["points"])[1] if clouds else 0
     for key, array in arrays.items():
@@ -248,7 +246,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     have = sorted(set(hashes) - {"manifest", *(meta.get("tables") or {})})
     if variant not in have:
         raise DataError(f"{folder} holds the arrays {have}, not {variant!r}: generate it again")
-    rows = read_manifest(folder, classes, hashes["manifest"])
+    rows = read_manifest(folder)
     kept = [row for row in rows if row.status == OK]
     points = _open_array(folder, variant, meta, verify)
     for start in range(0, len(points), _CHUNK_CLOUDS):

@@ -199,8 +199,7 @@ def check_varied(varied: Iterable[Override]) -> None:
         places = [one.key_or_group, *([one.package] if one.package else [])]
         if any(place.replace("/", ".").split(".")[0] not in VARIED for place in places):
             raise ConfigError(
-                f"{one.input_line}: with objective= only {', '.join(VARIED)} may vary, so that "
-                "all runs are judged in the same way"
+                f"{one.input_line}: only {', '.join(VARIED)} may vary with objective="
             )
 
 

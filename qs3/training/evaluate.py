@@ -252,7 +252,7 @@ def _write(
     write_result(run.folder / RESULT, result)
     write_predictions(run.folder / PREDICTIONS, predictions)
     if not evaluation.labelled:  # by the names of the user's files, with what is odd about each
-        rows = read_manifest(run.target.folder, evaluation.classes)
+        rows = read_manifest(run.target.folder)
         origins = {row.id: row.origin for row in rows if row.origin}
         strange = ood_reasons_of_all(evaluation.test, source_limits(data.all_labelled))
         write_predictions_of_files(

@@ -129,7 +129,7 @@ def load_data(run: Run, method: Method, given: Result | None = None) -> Loaded:
     if split == "train" or labels_of(target, split) is None:
         log.warning("%s has no labels for a test: only predictions are counted", target.name)
     cache, scale = data.target_domain.cache_dir, cfg.data.scale
-    rows = read_manifest(run.target.folder, target.classes)
+    rows = read_manifest(run.target.folder)
     known = labels_of(target, "train")
     ids = target.split("train").ids
     evaluation = Evaluation(

@@ -12,12 +12,12 @@ replaced. Who copies holds a lock there, which ends with its process: of runs th
 the first gives its warm-up, and who comes meanwhile waits for whole files.
 """
 
-import contextlib
 import hashlib
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -94,14 +94,11 @@ class SharedWarmup(Checkpoint):
         except Exception as error:  # a full disk, say: sharing is a convenience
             log.warning("the warm-up cannot be shared (%s); training goes on", error)
 
-    @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _alone(self) -> AbstractContextManager[None]:
         """Wait until no other run copies there, as far as a lock can say: it needs a file."""
         assert self.shared is not None
-        with contextlib.ExitStack() as stack:
-            if not self.shared.exists() or os.access(self.shared, os.W_OK):
-                stack.enter_context(locked(self.shared / ".lock"))
-            yield
+        writable = not self.shared.exists() or os.access(self.shared, os.W_OK)
+        return locked(self.shared / ".lock") if writable else nullcontext()
 
     def _is_there(self) -> bool:
         """Whether a complete one of this hash lies there, as it was written."""

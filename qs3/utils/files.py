@@ -58,7 +58,7 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
     except Exception as error:  # what damaged bytes do to a reader cannot be listed
         if isinstance(error, Qs3Error) and str(path) in str(error):
             raise
-        why = str(error).partition("\n")[0] or type(error).__name__
+        why = " ".join(str(error).split())[:300] or type(error).__name__
         raise DataError(f"{path} cannot be read: {why}") from error
 
 

@@ -194,26 +194,11 @@ class _Worker:
 
 @contextmanager
 def _held_back() -> Iterator[None]:
-    """Ctrl-C and SIGTERM come after this, so that no process is started by half.
-
-    A process that is started inherits the mask and takes it off itself. The mask is this thread's:
-    a signal that another thread takes is handled in the main one, and waits in its own handler.
-    """
-    arrived: list[int] = []
+    """Hold back Ctrl-C and SIGTERM in what is started here, until it takes them as `_work` says."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
-    handlers = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in _HELD_BACK:
-            if (handler := signal.getsignal(number)) not in (signal.SIG_IGN, None):
-                handlers[number] = handler
-                signal.signal(number, lambda number, frame: arrived.append(number))
     try:
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for late in dict.fromkeys(arrived):
-            signal.raise_signal(late)  # is held back by the mask, still
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 

@@ -27,12 +27,7 @@ Share = Annotated[float, Interval(ge=0, le=1)]
 Count = Annotated[int, Ge(1)]
 
 
-def is_odd(value: int) -> bool:
-    """Whether a whole number is odd."""
-    return value % 2 == 1
-
-
-IsOdd = Predicate(is_odd)
+IsOdd = Predicate(lambda value: value % 2 == 1)
 
 _CONFIG = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
 

@@ -19,27 +19,23 @@ def aligned(rows: Rows, *, numbers: bool = False, rule: bool = True) -> list[str
     return [first, *rules, *lines]
 
 
-def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
-    """Lines of Markdown, which are readable as they are, too; for `numbers` see `aligned`.
+def markdown(rows: Rows) -> list[str]:
+    """Lines of Markdown, which are readable as they are, too.
 
     A `|` in a cell is escaped; what else Markdown reads as a sign is kept.
     """
     rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
-    padded = _padded(rows, numbers)
+    padded = _padded(rows, numbers=False)
     first, *lines = [f"| {' | '.join(cells)} |" for cells in padded]
-    end = ":" if numbers else "-"
-    rules = ["-" * (len(cell) + 1) + (end if i else "-") for i, cell in enumerate(padded[0])]
-    return [first, f"|{'|'.join(rules)}|", *lines]
+    rule = "|".join("-" * (len(cell) + 2) for cell in padded[0])
+    return [first, f"|{rule}|", *lines]
 
 
 def csv_text(rows: Iterable[Iterable[Any]]) -> str:
     r"""CSV whose lines end with `\n`; None is an empty cell, a float has all its digits."""
-    lines = []
-    for row in rows:
-        file = io.StringIO(newline="")
-        csv.writer(file).writerow(row)  # ended by \r\n it quotes cells with a \r of their own
-        lines.append(file.getvalue().removesuffix("\r\n") + "\n")
-    return "".join(lines)
+    file = io.StringIO(newline="")
+    csv.writer(file, lineterminator="\n").writerows(rows)
+    return file.getvalue()
 
 
 def printable(text: str) -> str:

@@ -35,7 +35,7 @@ def opened(name, root, **more):
     """The domain, its clouds, and all rows of its manifest."""
     domain = compose_domain(name, {"paths.data_dir": str(root), **more})
     data = domain.open()
-    return domain, data, read_manifest(domain.folder, data.classes)
+    return domain, data, read_manifest(domain.folder)
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ def test_all_clouds_are_there_and_scans_of_an_object_are_called_so(tmp_path):
     assert data.ids == (
         *("bed/train/1", "bed/train/1~1", "bed/train/1~2", "chair/train/2", "chair/test/1"),
     )
-    rows = read_manifest(tmp_path / "joined", CLASSES)
+    rows = read_manifest(tmp_path / "joined")
     assert [row.origin for row in rows] == [
         *("a/bed/train/1", "a/bed/train/1~1", "b/bed/train/1", "b/chair/train/2", "a/chair/test/1"),
     ]

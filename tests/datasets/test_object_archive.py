@@ -25,7 +25,7 @@ def test_points_classes_and_parts(file, tmp_path):
     path, arrays = file
     found = domain(path, tmp_path)
     data = found.open()
-    rows = read_manifest(found.folder, data.classes)
+    rows = read_manifest(found.folder)
     assert data.counts() == {
         split: dict.fromkeys(data.classes, count) for split, count in (("train", 4), ("test", 2))
     }

@@ -40,7 +40,7 @@ def test_without_labels(tmp_path: Path) -> None:
     assert data.meta["labelled"] is False
     assert data.ids == ("train/b", "train/deep/a")
     assert data.splits.tolist() == ["train", "train"]
-    assert [row.cls for row in read_manifest(tmp_path / "store", TWO)] == ["", ""]
+    assert [row.cls for row in read_manifest(tmp_path / "store")] == ["", ""]
     assert data.counts() == {"train": {"bed": 0, "chair": 0}}
     assert data.split("train").ids == data.ids
 
@@ -129,7 +129,7 @@ def test_damage_can_be_skipped_and_is_recorded(tmp_path: Path, suffix: str) -> N
         own(tmp_path).open()
     data = own(tmp_path, on_error="skip").open()
     assert data.ids == ("bed/train/a_0002", "chair/train/a_0000")
-    rows = read_manifest(tmp_path / "store", TWO)
+    rows = read_manifest(tmp_path / "store")
     left_out = {row.origin for row in rows if row.status == "skipped"}
     assert left_out == {f"a{suffix}[1]", "b.npz"}
     own(tmp_path, on_error="skip").open()

@@ -52,7 +52,7 @@ def test_every_object_of_the_ten_classes_is_found_and_no_other(finished):
         f"chair/test/{VAL}_0", f"sofa/test/{VAL}_1", f"table/test/{VAL}_2",
     )  # fmt: skip
     assert pointset.points.shape == (6, 2048, 3)
-    rows = read_manifest(out, pointset.classes)
+    rows = read_manifest(out)
     assert rows[0].origin.startswith(f"scene {TRAIN}, object 2, label 'chairs', frames 0 ")
     for row in rows:
         frames = row.origin.split("frames ")[1].split(",")[0].split()
@@ -68,7 +68,7 @@ def test_every_object_of_the_ten_classes_is_found_and_no_other(finished):
 def test_each_cloud_lies_on_its_object(finished, recorded):
     """Depth is stored in millimetres: half of one, along the ray, is all the error there is."""
     out, pointset = finished
-    rows = read_manifest(out, pointset.classes)
+    rows = read_manifest(out)
     for row, cloud in zip(rows, pointset.points, strict=True):
         scene, number = row.origin.split(", object ")
         mesh = recorded[scene.split()[1]][0].bodies[int(number.split(",")[0])].mesh
@@ -85,12 +85,12 @@ def test_workers_change_no_byte_and_settings_are_heeded(finished, written, tmp_p
     run(written, tmp_path / "d", workers=2)
     assert contents(tmp_path / "d") == contents(finished[0])
     run(written, tmp_path / "few", views=2, stride=2)
-    for row in read_manifest(tmp_path / "few", CLASSES):
+    for row in read_manifest(tmp_path / "few"):
         frames = [int(n) for n in row.origin.split("frames ")[1].split(",")[0].split()]
         assert len(frames) <= 2
         assert all(frame % 2 == 0 for frame in frames)
     run(written, tmp_path / "large", min_points=5000)
-    rows = {row.id: row.status for row in read_manifest(tmp_path / "large", CLASSES)}
+    rows = {row.id: row.status for row in read_manifest(tmp_path / "large")}
     assert rows[f"chair/train/{TRAIN}_0"] == "skipped"
     assert rows[f"sofa/train/{TRAIN}_1"] == "ok"
     with pytest.raises(DataError):
@@ -130,10 +130,10 @@ def test_label_masks_that_deny_the_class_are_heeded(written, finished, recorded,
         labels[frame][150:170][strip] = ID_OF["wall"]
     write_zip(root / "scans" / TRAIN / f"{TRAIN}_2d-label-filt.zip", "label-filt", labels)
     run(root, tmp_path / "out")
-    rows = {row.id: row for row in read_manifest(tmp_path / "out", CLASSES)}
+    rows = {row.id: row for row in read_manifest(tmp_path / "out")}
     chair, sofa = rows[f"chair/train/{TRAIN}_0"], rows[f"sofa/train/{TRAIN}_1"]
     assert (chair.status, sofa.status) == ("skipped", "ok")
-    before = next(r for r in read_manifest(finished[0], CLASSES) if r.id == sofa.id)
+    before = next(r for r in read_manifest(finished[0]) if r.id == sofa.id)
     assert sofa.origin == before.origin  # the same frames, without the strip
     assert 0 < before.valid_points - sofa.valid_points < 0.3 * before.valid_points
 

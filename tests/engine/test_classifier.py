@@ -16,7 +16,7 @@ from qs3.methods.gast import Gast
 from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
 from qs3.models.pointdan import pointdan
-from qs3.selftraining.student_selection import Student
+from qs3.selftraining.student import Student
 from tests.methods.shapes import tiny_net
 
 

@@ -23,7 +23,7 @@ def test_from_memory_as_from_a_file(finished, meshes):
     clean = open_pointset(folder, "points_clean").points
     scans = qs3.generate({name: trimesh.load(file) for name, file in files.items()}, *WORDS)
     assert list(scans) == list(files)
-    rows = read_manifest(folder, made.classes)
+    rows = read_manifest(folder)
     for index, (name, scan) in enumerate(scans.items()):
         np.testing.assert_array_equal(scan.points, made.points[index])
         np.testing.assert_array_equal(scan.clean, clean[index])
@@ -85,10 +85,7 @@ def test_colliders_of_files_are_counted_in_the_manifest(tmp_path):
         settings = ["classes=[chair]", "workers=0", *words]
         cfg = config(tmp_path / name, path.parents[2], *settings, domain="modelnet10")
         made[name] = generate(cfg)
-    rows = {
-        name: read_manifest(tmp_path / name / "modelnet10", data.classes)[0]
-        for name, data in made.items()
-    }
+    rows = {name: read_manifest(tmp_path / name / "modelnet10")[0] for name, data in made.items()}
     assert made["bare"].sha256 == made["hidden"].sha256 != made["kept"].sha256
     assert rows["bare"].mesh_sha256 == rows["hidden"].mesh_sha256
     assert [row.reason for row in rows.values()] == ["", "colliders left out: 1", ""]

@@ -18,7 +18,7 @@ import yaml
 import qs3
 from qs3.classes import CLASSES
 from qs3.datasets.published import named_arrays
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import DataError, MissingDataError
 from qs3.inference.export import export_folder
 from qs3.inference.model_file import (
     CONFIG,
@@ -196,8 +196,6 @@ def test_what_is_not_a_run_is_missing(run, tmp_path):
     for place in (tmp_path / "nothing", run.parent, tmp_path, "dgcnn-speckel"):
         with pytest.raises(MissingDataError):
             qs3.load(place)
-    with pytest.raises(ConfigError):
-        qs3.load(tmp_path / "model.onnx")
 
 
 def test_the_card_holds_what_the_run_knows(run, folder, tmp_path):

@@ -20,7 +20,7 @@ from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
 from qs3.selftraining.pcfea import Pcfea
-from qs3.selftraining.student_selection import Student
+from qs3.selftraining.student import Student
 
 
 @dataclass(frozen=True)

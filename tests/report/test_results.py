@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from qs3.errors import DataError
+from qs3.errors import DataError, MissingDataError
 from qs3.report.results import Runs, load_runs, read_kept, summarise
 from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
 from tests.report.made_runs import CATALOGUE, scores, write_run
@@ -56,7 +56,7 @@ def test_unfinished_and_damaged_seeds_are_shown(tmp_path):
     assert f"seed 1: unfinished ({begun})" in text
     alone = Runs(found.lines[found.lines.seed == 1].dropna(axis=1))  # none is finished
     assert alone.problems == [f"seed 1: unfinished ({begun})"]
-    assert "metrics.json is damaged" in text
+    assert "metrics.json cannot be read" in text
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_summary_of_a_multirun(tmp_path):
 
 
 def test_a_kept_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(DataError, match=r"none\.csv\.gz"):
+    with pytest.raises(MissingDataError, match=r"none\.csv\.gz"):
         read_kept(tmp_path / "none.csv.gz")
     for content in (b"", b"a,b\n1,2\n", b"\x1f\x8b no gzip"):
         (tmp_path / "x.csv.gz").write_bytes(content)

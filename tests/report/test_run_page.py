@@ -171,7 +171,7 @@ def test_missing_or_damaged_data_cost_their_pictures_and_not_the_page(run, toy_d
     assert "<li>clouds: " in drawn.page.read_text()
     assert "is not at" in draw(run, data_dir=tmp_path).skipped["clouds"]
     change(run, data=DataHashes(source="0" * 64, target="0" * 64))
-    assert "another version of kinectsim10" in draw(run).skipped["clouds"]
+    assert "is not the kinectsim10" in draw(run).skipped["clouds"]
 
 
 def test_training_draws_and_its_hash_does_not_know(toy):

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from qs3.config.compose import choices
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.report.formats import TO_RUN, csv_text, grid, markdown, to_run
 from qs3.report.table import build_table
 from qs3.runs.metrics import DataHashes, DataMadeOf, EpochScores, Evaluated, Warmup
@@ -94,7 +94,7 @@ def test_entries(own):
 )
 def test_wrong_files(own, old, new):
     assert old in OWN
-    with pytest.raises(ConfigError):
+    with pytest.raises((ConfigError, DataError)):
         own(OWN.replace(old, new))
 
 
@@ -104,7 +104,7 @@ def test_what_is_asked_wrongly(own, tmp_path):
     ):  # fmt: skip
         with pytest.raises(ConfigError):
             own(**given)
-    with pytest.raises(ConfigError, match="no_such_table"):
+    with pytest.raises(MissingDataError, match="no_such_table"):
         build_table("no_such_table", tmp_path)
 
 

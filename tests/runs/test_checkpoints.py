@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.runs import checkpoints
 from qs3.runs.checkpoints import load, save, weights_sha256
 from tests.fixtures.harm import Harm
 
@@ -47,41 +46,6 @@ def test_student_result_and_checkpoint_have_the_same_weights(finished):
     for name, value in student.items():
         assert torch.equal(result[name], value)
         assert torch.equal(last[f"net.{name}"], value)
-
-
-class Broken:
-    """A file whose fourth write raises."""
-
-    def __init__(self, file, error):
-        self.file, self.error, self.writes = file, error, 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.file.close()
-
-    def __getattr__(self, name):
-        return getattr(self.file, name)
-
-    def write(self, data):
-        self.writes += 1
-        if self.writes > 3:
-            raise self.error
-        return self.file.write(data)
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(143), OSError(28, "full")])
-def test_what_breaks_a_write_off_is_raised_in_place_of_torch_s_error(error, tmp_path, monkeypatch):
-    """Ctrl-C and SIGTERM would be a traceback, and a sweep would go on with its next job."""
-    save({"epoch": 3}, tmp_path / "last.ckpt")
-    broken = lambda *words: Broken(open(*words), error)  # noqa: SIM115, E731
-    monkeypatch.setattr(checkpoints, "open", broken, raising=False)
-    with pytest.raises(Qs3Error if isinstance(error, OSError) else type(error)):
-        save({"w": torch.zeros(100_000)}, tmp_path / "last.ckpt")
-    monkeypatch.undo()
-    assert load(tmp_path / "last.ckpt") == {"epoch": 3}
-    assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
 
 
 @pytest.mark.parametrize("best", [np.float64(0.5), Path("a")])
@@ -127,7 +91,7 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
 
 def test_nothing_is_unpickled(tmp_path):
     torch.save({"w": torch.zeros(9), "harm": Harm(tmp_path / "harm")}, tmp_path / "a.pt")
-    with pytest.raises(DataError, match="UnpicklingError"):
+    with pytest.raises(DataError, match="Weights only"):
         load(tmp_path / "a.pt")
     assert not (tmp_path / "harm").exists()
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3.selftraining.student_selection import Student
+from qs3.selftraining.student import Student
 from tests.methods.shapes import tiny_net
 
 

@@ -56,7 +56,7 @@ def test_round_trip(tmp_path):
     clean = open_pointset(tmp_path / "d", "points_clean")
     assert clean.sha256 != found.sha256
     assert not np.array_equal(clean.points, found.points)
-    rows = read_manifest(tmp_path / "d", CLASSES)
+    rows = read_manifest(tmp_path / "d")
     assert [row.index for row in rows] == [0, None, 1, 2, None, 3, 4, 5]
     assert rows[1].reason == "empty mesh"
 
@@ -171,7 +171,7 @@ def test_same_input_same_bytes_wherever_it_lies(tmp_path):
 
 def test_content_hash_sees_what_training_sees_and_nothing_else(tmp_path):
     base = make(tmp_path / "0")
-    rows = read_manifest(tmp_path / "0", CLASSES)
+    rows = read_manifest(tmp_path / "0")
     moved = [dataclasses.replace(row, origin="elsewhere") for row in rows]
     assert make(tmp_path / "1", rows=moved).sha256 == base.sha256
     assert make(tmp_path / "2", meta={"other": 1}).sha256 == base.sha256

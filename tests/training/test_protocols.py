@@ -14,7 +14,7 @@ from qs3.methods.base import class_loss
 from qs3.methods.bounds import SourceOnly
 from qs3.models.pointnet import pointnet, transform_regulariser
 from qs3.runs.checkpoints import load
-from qs3.selftraining.student_selection import Student
+from qs3.selftraining.student import Student
 from qs3.training.command import train
 from tests.training.nets import featured
 

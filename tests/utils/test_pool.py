@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 from joblib import Parallel, delayed
 
 from qs3.errors import DataError
-from qs3.utils.pool import Processes, _held_back
+from qs3.utils.pool import Processes
 from tests.utils.pool_work import die_at_once, make, no_worker, pids_in_a_job
 
 
@@ -181,39 +180,3 @@ def test_a_script_runs_once_and_what_it_defines_is_found(tmp_path, script, said)
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.stdout, done.stderr) == (said, "")
-
-
-@pytest.fixture
-def ctrl_c_counts():
-    """As in a terminal: what a shell starts behind an & ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("ctrl_c_counts")
-@pytest.mark.parametrize("others", [0, 1])
-def test_ctrl_c_waits_until_a_process_has_started(others):
-    """With another thread, which takes the signal in the main one's place, too."""
-    over = threading.Event()
-    threads = [threading.Thread(target=over.wait) for _ in range(others)]
-    for thread in threads:
-        thread.start()
-    started = []
-
-    def start():
-        with _held_back():
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.05)
-            started.append(True)
-
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            start()
-        assert started
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    finally:
-        over.set()
-        for thread in threads:
-            thread.join()
