@@ -2,6 +2,7 @@
 
 import re
 
+import pandas as pd
 import pytest
 
 from qs3.report.comparison import against
@@ -45,3 +46,15 @@ def test_differences_stand_on_the_page(tmp_path):
         for d in one.subsets["all"]:
             mean, low, high = (f"{100 * value:.1f}" for value in (d.mean, d.low, d.high))
             assert re.search(rf"\+?{re.escape(mean)} \[{low}, {high}\]", text), one.name
+
+
+def test_means_over_folds_stand_on_the_page_about_own_scans(tmp_path):
+    built = build_table("own_scans", tmp_path, kept=RESULTS / "own_scans.csv.gz")
+    text = (ROOT / "docs" / "how-to" / "adapt.md").read_text("utf-8")
+    for cells in built.rows.values():
+        lines = pd.concat([cell.runs.finished for cell in cells])
+        assert len(lines) in (5, 15)
+        seeds = [f"{100 * of.accuracy.mean():.1f}" for _, of in lines.groupby("seed")]
+        means = [f"{100 * lines[name].mean():.1f}" for name in ("accuracy", "balanced_accuracy")]
+        shown = ", ".join(seeds) if len(seeds) > 1 else ""
+        assert f"| {means[0]} | {shown} | {means[1]} |".replace("|  |", "| |") in text
