@@ -3,7 +3,6 @@
 import re
 
 import numpy as np
-import scipy  # imports its parts when they are used
 from jaxtyping import Float
 
 
@@ -18,7 +17,8 @@ def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
     it is called IM.
     """
     mean = probabilities.mean(axis=0, keepdims=True)
-    of_mean, of_each = (scipy.special.entr(p).sum(axis=1).mean() for p in (mean, probabilities))
+    of_mean, of_each = (-(p * np.log(np.where(p == 0, 1, p))).sum(axis=1).mean()
+                        for p in (mean, probabilities))  # fmt: skip
     return float(np.maximum(0.0, of_mean - of_each))  # max() loses NaN
 
 
