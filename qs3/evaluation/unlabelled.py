@@ -28,7 +28,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # imports its parts when they are used, some of them slowly
 from jaxtyping import Float, Int
 
 from qs3.classes import CLASSES, known_as
@@ -72,8 +71,10 @@ def expected_accuracy(
     if known is None or len(probabilities) < FEWEST or not np.isfinite(probabilities).all():
         return None
     sure = float(scaled(probabilities, known.temperature).max(axis=1).mean())
-    base, here = scipy.special.logit(np.clip([known.accuracy, sure], _EDGE, 1 - _EDGE))
-    return float(scipy.special.expit(base - WEIGHT * max(0.0, base - here)))
+    from scipy.special import expit, logit  # slow to import, and a command prints `in_words`
+
+    base, here = logit(np.clip([known.accuracy, sure], _EDGE, 1 - _EDGE))
+    return float(expit(base - WEIGHT * max(0.0, base - here)))
 
 
 def in_words(expected: float | None) -> str:
@@ -94,21 +95,23 @@ def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray,
     weights = np.full(probabilities.shape, rest / max(1, classes - 1))
     weights[np.arange(len(labels)), labels] = 1 - rest
 
+    from scipy.optimize import minimize_scalar
+
     def loss(log_t: float) -> float:
         logs = np.log(np.maximum(scaled(probabilities, math.exp(log_t)), _TINY))
         # Exactly rounded, so that the order of clouds does not matter where the valley is flat.
         return -math.fsum((weights * logs).sum(axis=1)) / len(labels)
 
     # The loss is convex in 1 / T, so it has one valley in log T.
-    ends = math.log(_LEAST_T), math.log(_MOST_T)
-    found = scipy.optimize.minimize_scalar(loss, bounds=ends, method="bounded")
+    found = minimize_scalar(loss, bounds=(math.log(_LEAST_T), math.log(_MOST_T)), method="bounded")
     return math.exp(found.x)
 
 
 def scaled(probabilities: Float[np.ndarray, "n c"], t: float) -> Float[np.ndarray, "n c"]:
     """softmax(log p / t)."""
-    logits = np.log(np.maximum(probabilities, _TINY)) / t
-    return np.asarray(scipy.special.softmax(logits, axis=1))
+    from scipy.special import softmax
+
+    return np.asarray(softmax(np.log(np.maximum(probabilities, _TINY)) / t, axis=1))
 
 
 ESTIMATED = "estimated"
