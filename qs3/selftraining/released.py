@@ -98,6 +98,11 @@ class ReleasedRounds(SelfTraining):
         self.held_out = (index[held], labels[held])
         data.pseudo = (index[train], labels[train])
 
+    @property
+    def state_key(self) -> str:
+        """The base class's: a shared warm-up may be of either."""
+        return SelfTraining.__qualname__
+
     def state_dict(self) -> dict[str, Any]:
         """Also the held-out labels, and the best student so far."""
         more = {"held_out": self.held_out, "best": self.best, "weights": self.weights}
@@ -106,5 +111,5 @@ class ReleasedRounds(SelfTraining):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore `state_dict`."""
         super().load_state_dict(state_dict)
-        self.held_out, self.best = state_dict["held_out"], state_dict["best"]
-        self.weights = state_dict["weights"]
+        self.held_out, self.best = state_dict.get("held_out"), state_dict.get("best", 0.0)
+        self.weights = state_dict.get("weights")

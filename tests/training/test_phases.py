@@ -46,7 +46,7 @@ class Kept:
     def held_out(self, round_: int) -> tuple[torch.Tensor, torch.Tensor]:
         """As the checkpoint of the round's first epoch has it."""
         callbacks = self.checkpoint(3 + 2 * round_)["callbacks"]
-        pair: Any = next(v for k, v in callbacks.items() if "ReleasedRounds" in k)["held_out"]
+        pair: Any = callbacks["SelfTraining"]["held_out"]
         return pair
 
     def net(self, epoch: int) -> dict[str, torch.Tensor]:
@@ -137,7 +137,7 @@ def released(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
 def test_the_released_rounds_hold_out_a_fifth_of_what_a_pool_gives(released: Kept) -> None:
     """Only the best student by held-out pseudo-labels teaches, and it is the result."""
     states = [released.checkpoint(epoch) for epoch in (4, 6, 8)]
-    rounds = [next(v for k, v in s["callbacks"].items() if "ReleasedRounds" in k) for s in states]
+    rounds = [state["callbacks"]["SelfTraining"] for state in states]
     assert rounds[0]["best"] <= rounds[1]["best"] <= rounds[2]["best"]
     teachers = [load(released.folder / "warmup_selected.pt"), *(r["weights"] for r in rounds[:2])]
     for round_, teacher in enumerate(teachers):
