@@ -20,7 +20,7 @@ class Body:
 
     Attributes:
         mesh: world coordinates, metres.
-        albedo: reflectance in the near infrared, 0..1: diffuse, or a metal's.
+        albedo: reflectance in the near infrared, 0..1.
         label: 0 is background (floor, walls, clutter), 1 the object that is scanned.
         gloss: how it shines; None: it is matt (Lambertian).
     """

@@ -87,7 +87,6 @@ def _surface(bpy: Any, body: Body, ambient: float) -> Any:
         bsdf, colour = node("ShaderNodeBsdfPrincipled"), "Base Color"
         bsdf.distribution = "GGX"  # as `gloss`: light is not passed on from facet to facet
         bsdf.inputs["Roughness"].default_value = body.gloss.roughness
-        bsdf.inputs["Metallic"].default_value = float(body.gloss.metal)
         bsdf.inputs["IOR"].default_value = 1.5  # of level 0.5, which scales its reflectance
         bsdf.inputs["Specular IOR Level"].default_value = body.gloss.specular
     bsdf.inputs[colour].default_value = (body.albedo, body.albedo, body.albedo, 1.0)

@@ -1,16 +1,15 @@
 """Surfaces that are not matt: the principled model's base layers, one definition for all renderers.
 
-A glossy surface is a Lambertian one below a dielectric with rough facets, or a metal: what the
-Principled BSDF of Blender 4 gives with base colour, roughness, specular level and metallic alone,
-its distribution set to GGX. With unit vectors to the light (i), to the eye (o) and half-way (h)
+A glossy surface is a Lambertian one below a dielectric with rough facets: what the Principled BSDF
+of Blender 4 gives with base colour, roughness and specular level alone, its distribution set to
+GGX. With unit vectors to the light (i), to the eye (o) and half-way (h)
 
     f(i, o) = (1 - M(o)) albedo / pi + D(h) V(i, o) F(o . h)
 
 D and V are Trowbridge and Reitz's facets (Walter et al., EGSR 2007, eq. 33 and 34) with alpha =
 roughness^2 and masking correlated by height (Heitz, JCGT 2014, eq. 99). F of a dielectric is
 Fresnel's for the refractive index whose reflectance at normal incidence is 0.08 specular; M is its
-mean over the facets that are seen from o. A metal has no Lambertian part, and F = albedo + (1 -
-albedo) (1 - o . h)^5 (Schlick). Light is not passed on from facet to facet.
+mean over the facets that are seen from o. Light is not passed on from facet to facet.
 """
 
 import functools
@@ -32,12 +31,10 @@ class Gloss:
             a pixel.
         specular: 0..1, of a dielectric, reflectance at normal incidence over 0.08; 0.5 is glass or
             plastic (refractive index 1.5), 0 leaves the Lambertian part alone.
-        metal: the albedo is the reflectance at normal incidence, nothing is scattered below.
     """
 
     roughness: float = 0.5
     specular: float = 0.5
-    metal: bool = False
 
     @property
     def alpha(self) -> float:
@@ -60,12 +57,12 @@ def fresnel(gloss: Gloss, cosine: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1024)
 def kept_back(gloss: Gloss) -> np.ndarray:
-    """[COSINES] M(o) by the cosine of o: what does not reach the Lambertian part; 0 for metals.
+    """[COSINES] M(o) by the cosine of o: what does not reach the Lambertian part.
 
     The mean over the facets seen from o (drawn as Heitz, JCGT 2018, does), each weighed by the
     share of its reflected light that is not blocked.
     """
-    if gloss.metal or gloss.specular == 0:
+    if gloss.specular == 0:
         return np.zeros(COSINES)
     alpha = gloss.alpha
     cosine = np.maximum(np.linspace(0, 1, COSINES), 1e-3)[:, None]

@@ -28,8 +28,6 @@ class Facets:
     to_eye: Any
     square: Any
     refractive_index: Any
-    metal: Any
-    albedo: Any
 
     def __post_init__(self) -> None:
         self.cos_o = clip(self.dr, self.dr.dot(self.normal, self.to_eye), 1e-6, 1)
@@ -46,9 +44,8 @@ class Facets:
         met = clip(dr, dr.dot(self.to_eye, half), 0, 1)
         g = dr.sqrt(dr.square(self.refractive_index) - 1 + dr.square(met))
         other = (met * (g + met) - 1) / (met * (g - met) + 1)
-        dielectric = 0.5 * dr.square((g - met) / (g + met)) * (1 + dr.square(other))
-        metal = self.albedo + (1 - self.albedo) * (1 - met) ** 5
-        return self._spread(half) * seen * dr.select(self.metal, metal, dielectric)
+        fresnel = 0.5 * dr.square((g - met) / (g + met)) * (1 + dr.square(other))
+        return self._spread(half) * seen * fresnel
 
     def density(self, to_light: Any) -> Any:
         """Density of `reflected` over the solid angle (Heitz, JCGT 2018, eq. 17)."""
@@ -110,9 +107,9 @@ class GlossyScene(JitScene):
         super().__init__(mi, scene, solid)
         kinds = [body.gloss or _MATT for body in scene.bodies]
         self._body = mi.UInt32(self.faces.body)
-        numbers = [(kind.alpha**2, kind.refractive_index, float(kind.metal)) for kind in kinds]
+        numbers = [(kind.alpha**2, kind.refractive_index) for kind in kinds]
         columns = np.array(numbers, dtype=np.float32).T
-        self._square, self._index, self._metal = map(mi.Float, np.ascontiguousarray(columns))
+        self._square, self._index = map(mi.Float, np.ascontiguousarray(columns))
         tables = np.concatenate([kept_back(kind) for kind in kinds])
         self._kept_back = mi.Float(tables.astype(np.float32))
         self._area = scene.area
@@ -171,18 +168,17 @@ class GlossyScene(JitScene):
         """Pi f of the Lambertian part, and the facets."""
         mi, dr = self._mi, self._dr
         body = dr.gather(mi.UInt32, self._body, face, valid)
-        square, index, metal = (
-            dr.gather(mi.Float, values, body, valid)
-            for values in (self._square, self._index, self._metal)
+        square, index = (
+            dr.gather(mi.Float, values, body, valid) for values in (self._square, self._index)
         )
-        facets = Facets(mi, dr, normal, to_eye, square, index, metal > 0, albedo)
+        facets = Facets(mi, dr, normal, to_eye, square, index)
         place = facets.cos_o * (COSINES - 1)
         low = mi.UInt32(clip(dr, place, 0, COSINES - 2))
         left, right = (
             dr.gather(mi.Float, self._kept_back, body * COSINES + low + i, valid) for i in (0, 1)
         )
         kept = dr.lerp(left, right, place - mi.Float(low))
-        return dr.select(metal > 0, 0, albedo * (1 - kept)), facets
+        return albedo * (1 - kept), facets
 
     def _from_area(
         self, point: Any, facing: Any, valid: Any, lamp: Any, diffuse: Any, facets: Facets

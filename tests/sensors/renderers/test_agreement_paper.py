@@ -84,9 +84,7 @@ def compare(name, samples, gloss=None, light=None):
     fill = [100 * np.isfinite(match)[on].mean() for match in found]
     middle, tail_px = np.percentile(np.abs(difference), [50, 95])
     assert middle < 0.05
-    # Of a metal most pixels are dark: noise of samples is as large as what there is to match.
-    tail = 1.0 if gloss is not None and gloss.metal else 0.5
-    assert tail_px < tail
+    assert tail_px < 0.5
     assert abs(np.median(difference)) < 0.01
     assert abs(fill[0] - fill[1]) < 2
     assert (images[0].label != images[1].label).sum() < 10
@@ -117,7 +115,7 @@ def test_disparities_agree_in_a_window(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gloss", [None, Gloss(0.5), Gloss(0.25, 1.0), Gloss(0.4, metal=True)])
+@pytest.mark.parametrize("gloss", [None, Gloss(0.5), Gloss(0.25, 1.0)])
 @pytest.mark.parametrize("name", ["chair", "sphere", "torus"])
 def test_disparities_agree_on_shiny_bodies_in_the_paper_s_light(name, gloss):
     """The light of conf/light/area.yaml."""
