@@ -17,11 +17,15 @@ def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
     it is called IM.
     """
     mean = probabilities.mean(axis=0, keepdims=True)
-    of_mean, of_each = (-(p * np.log(np.where(p == 0, 1, p))).sum(axis=1).mean()
-                        for p in (mean, probabilities))  # fmt: skip
-    return float(np.maximum(0.0, of_mean - of_each))  # max() loses NaN
+    return float(np.maximum(0.0, _entropy(mean) - _entropy(probabilities)))  # max() loses NaN
+
+
+def _entropy(probabilities: Float[np.ndarray, "n k"]) -> float:
+    """The rows' mean entropy, in nats."""
+    logs = np.log(np.where(probabilities == 0, 1, probabilities))
+    return float(-(probabilities * logs).sum(axis=1).mean())
 
 
 def chosen_in_words(chosen: str) -> str:
-    """`selection.teacher` or `.student` of metrics.json for people, who count epochs from 1."""
+    """`selection.teacher` of metrics.json for people, who count epochs from 1."""
     return re.sub(r"(?<=, epoch )\d+", lambda epoch: str(int(epoch[0]) + 1), chosen)
