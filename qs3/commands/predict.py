@@ -63,7 +63,6 @@ def predict(
         qs3 predict depth=frame.png mask=mask.png intrinsics=525,525,319.5,239.5 camera_height=1.2
         qs3 predict ckpt=RUN depth=a.npy box=210,95,480,430 intrinsics=cam.yaml up=0,-0.97,-0.24
     """
-    from qs3.evaluation.unlabelled import in_words
     from qs3.inference import inputs, model_file
     from qs3.inference import page as pages
     from qs3.inference import predict as steps
@@ -99,21 +98,19 @@ def predict(
     rate = len(samples) / max(time.monotonic() - began, 1e-9)
     notes = steps.notes(first, found.kind, floor is not None)
     data, worth = first.result.data, first.result.worth
-    verdict = in_words(steps.expected(samples, first))
     lines = [
         *([] if ckpt else [f"classifier: {name}, which comes with qs3 (ckpt=)"]),
         *notes,
         f"{len(samples)} clouds, {rate:.1f} clouds a second, from {len(found.units)} {found.kind}s",
         *found.notes,
         *steps.summary(samples, first.classes),
-        *([verdict] if verdict else []),
         *([f"the classifier's data: {data}"] if data else []),
         *([f"accuracy on real objects: {worth}"] if worth else []),
         f"saved {out}",
     ]
     write_text(out, steps.as_csv(samples, first.classes))
     if page:
-        about = {"trained_on": data, "worth": worth, "notes": notes, "verdict": verdict}
+        about = {"trained_on": data, "worth": worth, "notes": notes}
         html = pages.page(
             printable(f"{(input or depth or Path()).absolute().name}, as {name} sees it"),
             samples,

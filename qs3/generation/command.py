@@ -22,6 +22,7 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.kept import OBJECTS, PROVENANCE, clouds_picture
 from qs3.generation.made_of import made_of
 from qs3.generation.plan import Plan, code_fingerprint, planned
+from qs3.generation.rooms import Rooms
 from qs3.generation.workers import (
     COLLIDERS,
     Job,
@@ -95,7 +96,8 @@ def generate(cfg: DictConfig) -> PointSet:
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
             job = replace(job, expected={**software(), **renderer}, check_place=place)
-        passing = _scan_missing(job, tasks, parts, pool, domain.label)
+        kind = "rooms" if isinstance(plan.recipe, Rooms) else "objects"
+        passing = _scan_missing(job, tasks, parts, pool, f"{kind} of {domain.label}")
         outcomes = _collect(tasks, parts, passing, folder)
         made = _made(plan, outcomes)
         # The dataset last: with meta.yaml it counts as finished, and the parts can go.
@@ -322,4 +324,4 @@ def _report(
     if others := pointset.meta.get("folders_left_alone"):
         log.info("folders of other classes: %s", ", ".join(others["names"]))
     log.info("made of: %s", pointset.made_of)
-    log.info("content hash %s, %.0f s", pointset.sha256[:16], seconds)
+    log.info("content hash %s, %.0f s: %s", pointset.sha256[:16], seconds, pointset.folder)

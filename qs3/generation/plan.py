@@ -262,10 +262,10 @@ class Plan:
         return plain
 
     def benchmark(self, recipe: Mapping[str, Any]) -> str:
-        """Whether this is the benchmark that a domain's version names, a split of it, or like it.
+        """Whether this is the benchmark that a domain's version names, a split of it, or another.
 
-        "kinectsim10 v2"; "kinectsim10 v2, train" for its train part alone; "like kinectsim10 v2,
-        but not it" where settings or objects differ; empty for domains without a version.
+        "kinectsim10 v2"; "kinectsim10 v2, train" for its train part alone; "kinectsim10 v2 with
+        other settings or objects"; empty for domains without a version.
         """
         stated = self.cfg.get("benchmark")
         if stated is None:
@@ -280,7 +280,7 @@ class Plan:
             full = {**recipe, "objects": [_name_and_content(item) for item in whole]}
             if recipe["objects"] == part and plan_hash(full) == stated.plan_sha256:
                 return f"{name}, {' and '.join(splits)}"
-        return f"like {name}, but not it (other settings or objects)"
+        return f"{name} with other settings or objects"
 
 
 def planned(cfg: DictConfig) -> Plan:

@@ -58,7 +58,6 @@ class Sample:
         points: of the cloud; None if it could not be read.
         reason: in what it is out of range, or why it failed; "" otherwise.
         probabilities: [C] float64; None if it failed.
-        without_prior: the same, with classes as common as in training.
         cls: the likeliest class; "" if it failed.
         second: the class that another classifier names; "" without one.
     """
@@ -76,7 +75,6 @@ class Sample:
     points: int | None = None
     reason: str = ""
     probabilities: Float[np.ndarray, " c"] | None = None
-    without_prior: Float[np.ndarray, " c"] | None = None
     cls: str = ""
     second: str = ""
 

@@ -30,7 +30,6 @@ from pydantic import ConfigDict, Field, TypeAdapter
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.evaluation.unlabelled import HeldOut
 from qs3.runs.checkpoints import load, save
 from qs3.utils.files import atomic_path, make_folder, reading, sha256_file, write_json, write_text
 from qs3.utils.text_table import printable
@@ -67,9 +66,8 @@ class Result:
         floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
         worth: accuracy on real objects, in a sentence; "" if it was not measured.
         data: what its source and target are made of, in a sentence; "" if that is not known.
-        held_out: what it is on held-out labelled clouds, see `qs3.evaluation.unlabelled`; None if
-            nothing is known.
-        learnt: shares of the classes in its training, see `qs3.evaluation.unlabelled`; likewise.
+        learnt: shares of the classes in its training, see `qs3.evaluation.prior`; None if they
+            are not known.
     """
 
     model: dict[str, Any]
@@ -84,7 +82,6 @@ class Result:
     floor_m: float | None = None
     worth: str = ""
     data: str = ""
-    held_out: HeldOut | None = None
     learnt: tuple[Annotated[float, Gt(0)], ...] | None = None
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")

@@ -65,8 +65,7 @@ def page(
         classes: names in the order of the probabilities.
         floor_m: z of the floor, if the net knows heights: cards say how high an object begins.
         about: for the template: `trained_on`, what the net's data are made of; `worth`, its
-            accuracy on real objects; `notes`, what was assumed; `verdict`, how many are expected to
-            be right.
+            accuracy on real objects; `notes`, what was assumed.
     """
     found = scores(samples, classes)
     predicted = [one for one in samples if one.cls]
@@ -94,7 +93,7 @@ def page(
         failed=[(one.name, one.reason) for one in samples if not one.cls],
         most=MOST_SHOWN,
         confusion=confusion_rows(found.confusion, classes) if found else [],
-        **{"trained_on": "", "worth": "", "notes": (), "verdict": "", **about},
+        **{"trained_on": "", "worth": "", "notes": (), **about},
     )
 
 

@@ -15,7 +15,6 @@ from jaxtyping import Int
 from qs3.datasets.pointed import LEVEL, PLANES
 from qs3.errors import ConfigError
 from qs3.evaluation.ood import other_units
-from qs3.evaluation.unlabelled import expected_accuracy
 from qs3.inference.inputs import Sample
 from qs3.inference.predictor import Predictor, load
 from qs3.kernels.norms import use_trained
@@ -99,20 +98,14 @@ def second_opinion(name: str, first: Predictor, floor: float | None, **how: Any)
     return second
 
 
-def expected(samples: Sequence[Sample], predictor: Predictor) -> float | None:
-    """The share of answers that is expected to be right, without a look at labels."""
-    plain = [one.without_prior for one in samples if one.without_prior is not None]
-    return expected_accuracy(predictor.result.held_out, np.array(plain)) if plain else None
-
-
 def notes(predictor: Predictor, kind: str, floor_known: bool) -> list[str]:
     """What is taken for granted about the clouds, for terminal and page."""
     found = [predictor.prior.words] if predictor.prior else []
     if predictor.in_metres and kind == "file":
         found.append("the classifier knows sizes: coordinates count as metres")
     if predictor.needs_floor and not floor_known:
-        height = predictor.camera_height
-        found.append(f"the camera counts as {height:g} m above the floor (camera_height=)")
+        height = f"{predictor.camera_height:g} m above the floor, as in training"
+        found.append(f"the camera counts as {height} (camera_height=)")
     if predictor.result.gravity == "none" and kind != "depth image":
         found.append("the classifier knows clouds in the frame of their camera, not z up")
     return found

@@ -27,7 +27,7 @@ from qs3.datasets.importing import check_cloud, thinned, turned
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, other_units, relax_min_points
-from qs3.evaluation.unlabelled import POWER, Prior, read_prior
+from qs3.evaluation.prior import POWER, Prior, read_prior
 from qs3.inference.inputs import Sample, pointed
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.processor import keep_freed_memory
@@ -143,19 +143,14 @@ class Predictor:
         floor: float | None = None,
     ) -> Float[np.ndarray, "n c"]:
         """Class probabilities of prepared clouds, with `prior`; n >= 1. `floor` as in `prepare`."""
-        found = self._plain(points, batch_size, self.floor(floor))
-        return self.prior(found) if self.prior else found
-
-    def _plain(
-        self, points: Float[Tensor, "n m 3"], batch_size: int, floor: float
-    ) -> Float[np.ndarray, "n c"]:
-        """Without `prior`; where the origin cannot be the camera, averaged over all sides."""
-        sides = _SIDES if self.result.scale == "seen" and floor >= 0 else 1
+        # Where the origin cannot be the camera, averaged over all sides.
+        sides = _SIDES if self.result.scale == "seen" and self.floor(floor) >= 0 else 1
         found = []
         for k in range(sides):
             turned = rotate_z(points, torch.full((len(points),), 2 * torch.pi * k / sides))
             found.append(predict(self.net, turned if k else points, batch_size, self.device))
-        return np.mean(found, axis=0)
+        mean = np.mean(found, axis=0)
+        return self.prior(mean) if self.prior else mean
 
     def __call__(
         self,
@@ -209,13 +204,12 @@ class Predictor:
         if not ready:
             return
         stacked = torch.stack([points for _, points in ready])
-        plain = self._plain(stacked, len(ready), self.floor(floor))
-        found = self.prior(plain) if self.prior else plain
-        for (one, _), raw, each in zip(ready, plain, found, strict=True):
-            if np.isnan(raw).any():
+        found = self.probabilities(stacked, len(ready), floor)
+        for (one, _), each in zip(ready, found, strict=True):
+            if np.isnan(each).any():
                 one.failed(DIVERGED)
                 continue
-            one.without_prior, one.probabilities = raw, each
+            one.probabilities = each
             one.cls = self.classes[int(each.argmax())]
 
     def predict_depth(
@@ -292,7 +286,7 @@ def load(
             package, if you trust it to be built with any arguments.
         prior: how common classes are where the clouds come from: "rooms", as in ScanNet's, or
             {"chair": 4, "bathtub": 0}, where those not named count as 1; None: as in training.
-        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.evaluation.unlabelled`).
+        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.evaluation.prior`).
 
     Raises:
         MissingDataError: no finished run there.

@@ -21,7 +21,6 @@ from omegaconf import OmegaConf
 from qs3.config.hydra import in_multirun
 from qs3.datasets.domain import Domain
 from qs3.errors import MissingDataError, Qs3Error
-from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.inference.page import confusion_rows
 from qs3.report.datasets import opened_domain, part_of
@@ -165,7 +164,6 @@ def draw(
         "run.html",
         title=run.title,
         m=m,
-        in_words=in_words,
         chosen_in_words=chosen_in_words,
         confusion=confusion,
         rounds=rounds,

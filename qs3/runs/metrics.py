@@ -128,15 +128,11 @@ class Quality:
 
     Attributes:
         validation_accuracy: on held-out labelled clouds.
-        expected: accuracy by `qs3.evaluation.unlabelled`, of the net before self-training if there
-            was any, with the norms it was trained with: what adapts a net to clouds makes it surer
-            of them.
         unlike_source: share of clouds outside the usual range of the labelled ones.
         never_predicted: classes.
     """
 
     validation_accuracy: float
-    expected: float | None = None
     unlike_source: float
     never_predicted: list[str]
 

@@ -11,7 +11,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.datasets.domain import check_or_make
-from qs3.evaluation.unlabelled import in_words
 from qs3.evaluation.validators import chosen_in_words
 from qs3.runs.folder import read_started
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
@@ -49,6 +48,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
     if (run.folder / OF_FILES).is_file():
         log.info("the class of each file: %s", run.folder / OF_FILES)
+        log.info("of other scans: qs3 predict ckpt=%s input=PATH", run.folder)
     log.info("see %s", run.folder / METRICS)
     return metrics
 
@@ -76,7 +76,6 @@ def headline(metrics: RunMetrics) -> str:
     if final.accuracy is None:
         counts = ", ".join(f"{name} {count}" for name, count in final.predicted.items() if count)
         text += f"no labels to judge {target} by; predicted {counts}"
-        text += f"; {estimate}" if (estimate := in_words(metrics.quality.expected)) else ""
     else:
         text += f"accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
         text += f"on {target}, majority rate {final.majority_rate:.1%}"

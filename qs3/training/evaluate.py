@@ -17,7 +17,7 @@ from qs3.config.hydra import component_names, config_hash, config_sha256
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.norms import adapt_norms, minimise_entropy
 from qs3.evaluation.ood import limits, ood_reasons_of_all, ood_share, source_limits
-from qs3.evaluation.unlabelled import Prior, expected_accuracy, held_out
+from qs3.evaluation.prior import Prior
 from qs3.evaluation.validators import infomax
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result
@@ -93,12 +93,9 @@ class SavedNets:
             self._nets[key] = net
         return self._nets[key]
 
-    def of(self, which: str, file: Path, norms: str | None = None) -> Float[np.ndarray, "n c"]:
-        """Probabilities of some of the `clouds` by a file's weights, with norms for their domain.
-
-        `norms`: of clouds of the target others than `evaluation.norms`.
-        """
-        norms, domain = norms or self.run.cfg.evaluation.norms, "target"
+    def of(self, which: str, file: Path) -> Float[np.ndarray, "n c"]:
+        """Probabilities of some of the `clouds` by a file's weights, with their domain's norms."""
+        norms, domain = self.run.cfg.evaluation.norms, "target"
         if which == "validation" and self.data.owner == "source":
             norms, domain = TRAINED, "source"
         key = self._weights_in(file), which, norms
@@ -112,7 +109,7 @@ class SavedNets:
 def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
     """Score the warm-up's and the student's weights; write the model file and the predictions.
 
-    Scores and predictions are with `evaluation.prior`, estimates and validators without.
+    Scores and predictions are with `evaluation.prior`, validators without.
 
     Returns:
         What `metrics.json` is to hold. The caller writes it last: it marks a run as finished.
@@ -181,7 +178,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> RunMetrics:
             for record in built.rounds.records
         ],
         infomax=score if math.isfinite(score) else None,
-        quality=_quality(run, loaded, nets, file),
+        quality=_quality(loaded, nets, file),
         data=DataHashes(**loaded.started["data"]),
         made_of=loaded.made_of,
         times=built.clock.taken(),
@@ -202,17 +199,13 @@ def _selection(run: Run, loaded: Loaded, warmup: WarmupSelection) -> Selection:
     return Selection(teacher=teacher, student="last" if run.scheme.rounds else teacher)
 
 
-def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
+def _quality(loaded: Loaded, nets: SavedNets, file: Path) -> Quality:
     data, classes = loaded.data, loaded.evaluation.classes
     labels, table = data.validation.labels.numpy(), nets.of("test", file)
-    # What adapts a net to these clouds makes it surer of them than it is right.
-    before = run.folder / WARMUP_SELECTED if run.scheme.rounds else file
-    known = held_out(nets.of("validation", before, TRAINED), labels)
     counts = np.bincount(table.argmax(axis=1), minlength=len(classes))
     right = nets.of("validation", file).argmax(axis=1) == labels
     return Quality(
         validation_accuracy=float(right.mean()),
-        expected=expected_accuracy(known, nets.of("test", before, TRAINED)),
         unlike_source=ood_share(loaded.evaluation.test, data.all_labelled),
         never_predicted=[name for name, n in zip(classes, counts, strict=True) if not n],
     )
@@ -230,9 +223,6 @@ def _write(
     """What is reported, with all that using it elsewhere takes, and what it predicts."""
     cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
     model: Any = OmegaConf.to_container(cfg.model, resolve=True)
-    known = None
-    if cfg.evaluation.norms == TRAINED:
-        known = held_out(nets.of("validation", file), data.validation.labels.numpy())
     floor = run.target.floor_m if cfg.data.scale in HEIGHTS else None
     result = Result(
         model=model,
@@ -246,7 +236,6 @@ def _write(
         weights=copy_weights(nets(file)),
         floor_m=None if floor is None else float(floor),
         data=made_of,
-        held_out=known,
         learnt=tuple(learnt.tolist()),
     )
     write_result(run.folder / RESULT, result)

@@ -17,7 +17,7 @@ from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
-from qs3.evaluation.unlabelled import ESTIMATED, Prior, estimate_shares, read_prior, shares_of
+from qs3.evaluation.prior import ESTIMATED, Prior, estimate_shares, read_prior, shares_of
 from qs3.inference.model_file import Result, read_result
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf, RoundRecord
@@ -33,7 +33,7 @@ _BELOW_M = 0.3  # under all of the other domain; floors are known to a decimetre
 _LOOKED_AT = 1000  # clouds, for the floor: those are read from disk
 
 Shares = Float[np.ndarray, " c"]
-"""[C], of the classes in what a net learnt from: u in `qs3.evaluation.unlabelled`."""
+"""[C], of the classes in what a net learnt from: u in `qs3.evaluation.prior`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from qs3.classes import CLASSES
 from qs3.errors import ConfigError
-from qs3.evaluation.unlabelled import ROOMS, estimate_shares, read_prior, shares_of
+from qs3.evaluation.prior import ROOMS, estimate_shares, read_prior, shares_of
 
 AB = ("a", "b")
 THREE = ("chair", "table", "lamp")

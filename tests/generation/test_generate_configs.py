@@ -72,11 +72,11 @@ def test_benchmarks_know_themselves_and_their_parts():
     assert benchmark() == "kinectsim10 v3"
     assert benchmark("renderer.threads=2", "renderer.variant=scalar_rgb") == "kinectsim10 v3"
     for other in ("fraction=0.5", "views=3", "renderer.samples=16", "recipe.min_points=100"):
-        assert benchmark(other).startswith("like kinectsim10 v3, but not it")
-    assert benchmark("splits=[train]", other).startswith("like kinectsim10 v3, but not it")
+        assert benchmark(other).startswith("kinectsim10 v3 with other")
+    assert benchmark("splits=[train]", other).startswith("kinectsim10 v3 with other")
     assert benchmark("splits=[train]") == "kinectsim10 v3, train"
     assert benchmark(domain="rooms10") == "rooms10 v2"
-    assert benchmark("recipe.by_class=0", domain="rooms10").startswith("like rooms10 v2, but")
+    assert benchmark("recipe.by_class=0", domain="rooms10").startswith("rooms10 v2 with")
     assert benchmark(domain="kinectsim10_full") == "kinectsim10_full v2"
     assert benchmark(domain="kinectsim10_shifted") == "kinectsim10_shifted v1"
 

@@ -13,7 +13,7 @@ import torch
 import trimesh
 
 import qs3
-from qs3.evaluation.unlabelled import read_prior
+from qs3.evaluation.prior import read_prior
 from qs3.geometry.sampling import surface_sample
 from qs3.inference import model_file
 from qs3.inference.export import export_folder
@@ -228,22 +228,6 @@ def test_a_prior_is_that_of_python(run, clouds, tmp_path):
     plain = qs3.load(run)(clouds)
     by_hand = read_prior(given, ("ball", "rod", "slab"), read_result(run).shares, 1)(plain)
     np.testing.assert_allclose(expected, by_hand)
-
-
-def test_how_many_are_expected_right(run, clouds, tmp_path, capsys):
-    """Without a look at labels or the prior; of few clouds nothing is printed."""
-    np.save(tmp_path / "a.npy", np.concatenate([clouds, clouds]))
-    np.save(tmp_path / "few.npy", clouds[:20])
-    out, shares = tmp_path / "said.csv", []
-    for words in (["prior=rod:8", "page=false"], []):
-        assert predict(run, out, str(tmp_path / "a.npy"), *words) == 0
-        said = re.search(r"\nabout (\d+)% expected right \(±11\)\n", capsys.readouterr().out)
-        shares.append(int(said[1]))
-    assert 0 < shares[0] <= 100 * read_result(run).held_out.accuracy + 0.5
-    assert shares[0] == shares[1]
-    assert "expected right" in out.with_suffix(".html").read_text()
-    assert predict(run, out, str(tmp_path / "few.npy"), "page=false") == 0
-    assert "expected right" not in capsys.readouterr().out
 
 
 def test_a_second_classifier_is_asked_and_counted(run, clouds, tmp_path, capsys):

@@ -1,17 +1,6 @@
-"""What a net's probabilities say of clouds without labels: how many are right, how common classes.
+"""How common classes are where clouds without labels come from.
 
-**Expected accuracy.** Confidences alone are too high on clouds of another kind, so the accuracy on
-held-out labelled clouds is taken down by what is lost in confidence from there to here:
-
-    logit(expected) = logit(a) - w max(0, logit(a) - logit(c)),
-
-with a the accuracy on the held-out clouds and c the mean largest probability, calibrated on these
-(`temperature`). w is fitted to 212 pairs of a net and a target, simulated and real, whose accuracy
-is known: least squares of the logits, each target counting the same. Of the terms that were tried
-(shapes of the clouds, frequencies of classes, ...) this one alone has the smallest error on a
-target that is left out.
-
-**Prior.** A net has learnt how common classes were in its training, which is as likely as not every
+A net has learnt how common classes were in its training, which is as likely as not every
 class alike; in rooms two things in five are chairs. With p the net's probabilities, u the classes'
 shares in training and q those where the clouds come from,
 
@@ -23,7 +12,6 @@ t as a choice is Menon et al., "Long-tail learning via logit adjustment", ICLR 2
 `estimate_shares` finds q from clouds without labels.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -32,87 +20,6 @@ from jaxtyping import Float, Int
 
 from qs3.classes import CLASSES, known_as
 from qs3.errors import ConfigError
-
-WEIGHT = 1.7245
-"""w."""
-
-ERROR = 0.11
-"""Mean of |expected - true accuracy| over the pairs, by weights that did not see their targets."""
-
-FEWEST = 30
-"""With fewer clouds a mean confidence is too rough for an estimate."""
-
-_EDGE = 0.02  # shares nearer to 0 or 1 count as this
-_LEAST_T, _MOST_T, _TINY = 0.05, 20.0, 1e-300
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """What a net is on v held-out labelled clouds: (right + 1) / (v + 2), and `temperature`."""
-
-    accuracy: float
-    temperature: float
-
-
-def held_out(
-    probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray, " v"]
-) -> HeldOut | None:
-    """What a net's answers to held-out labelled clouds say; None if it has diverged."""
-    if not np.isfinite(probabilities).all():
-        return None
-    right = int((probabilities.argmax(axis=1) == labels).sum())
-    return HeldOut((right + 1) / (len(labels) + 2), temperature(probabilities, labels))
-
-
-def expected_accuracy(
-    known: HeldOut | None, probabilities: Float[np.ndarray, "n c"]
-) -> float | None:
-    """The expected share of right answers; None where it cannot be estimated."""
-    if known is None or len(probabilities) < FEWEST or not np.isfinite(probabilities).all():
-        return None
-    sure = float(scaled(probabilities, known.temperature).max(axis=1).mean())
-    from scipy.special import expit, logit  # slow to import, and a command prints `in_words`
-
-    base, here = logit(np.clip([known.accuracy, sure], _EDGE, 1 - _EDGE))
-    return float(expit(base - WEIGHT * max(0.0, base - here)))
-
-
-def in_words(expected: float | None) -> str:
-    """Such as "about 40 % expected right (±11)"; "" of None."""
-    return "" if expected is None else f"about {expected:.0%} expected right (±{100 * ERROR:.0f})"
-
-
-def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray, " v"]) -> float:
-    """The T in [0.05, 20] for which softmax(log p / T) has the least cross-entropy to the labels.
-
-    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, section 4.2. A label counts
-    (v + 1) / (v + 2), the other classes share the rest (Laplace's rule of succession, as in Platt,
-    "Probabilistic Outputs for Support Vector Machines", 1999, section 2.2): a net that makes no
-    error on v >= 1 clouds is not taken to make none at all.
-    """
-    classes = probabilities.shape[1]
-    rest = 1 / (len(labels) + 2)
-    weights = np.full(probabilities.shape, rest / max(1, classes - 1))
-    weights[np.arange(len(labels)), labels] = 1 - rest
-
-    from scipy.optimize import minimize_scalar
-
-    def loss(log_t: float) -> float:
-        logs = np.log(np.maximum(scaled(probabilities, math.exp(log_t)), _TINY))
-        # Exactly rounded, so that the order of clouds does not matter where the valley is flat.
-        return -math.fsum((weights * logs).sum(axis=1)) / len(labels)
-
-    # The loss is convex in 1 / T, so it has one valley in log T.
-    found = minimize_scalar(loss, bounds=(math.log(_LEAST_T), math.log(_MOST_T)), method="bounded")
-    return math.exp(found.x)
-
-
-def scaled(probabilities: Float[np.ndarray, "n c"], t: float) -> Float[np.ndarray, "n c"]:
-    """softmax(log p / t)."""
-    from scipy.special import softmax
-
-    return np.asarray(softmax(np.log(np.maximum(probabilities, _TINY)) / t, axis=1))
-
 
 ESTIMATED = "estimated"
 """In a config: shares of the target's training clouds, by `estimate_shares`."""
