@@ -106,6 +106,7 @@ def generate(cfg: DictConfig) -> PointSet:
         pointset = _write(plan, made, recipe)
         parts.clear()
     _report(pointset, made, outcomes, time.perf_counter() - start)
+    log.info("the clouds are in %s", folder)
     _judge_failed(plan, pointset)
     return pointset
 
@@ -324,4 +325,4 @@ def _report(
     if others := pointset.meta.get("folders_left_alone"):
         log.info("folders of other classes: %s", ", ".join(others["names"]))
     log.info("made of: %s", pointset.made_of)
-    log.info("content hash %s, %.0f s: %s", pointset.sha256[:16], seconds, pointset.folder)
+    log.info("content hash %s, %.0f s", pointset.sha256[:16], seconds)
