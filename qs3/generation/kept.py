@@ -186,7 +186,7 @@ def reason_image(reason: np.ndarray) -> tuple[str, Image]:
     shares = []
     for one, bgr in REASON_COLOURS.items():
         image[reason == one] = bgr[::-1]
-        if share := float((reason == one).mean()):
+        if (share := float((reason == one).mean())) >= 0.0005:
             shares.append(f"{one.name.lower()} {share:.1%}")
     return "\n".join(shares), image
 

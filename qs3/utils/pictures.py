@@ -10,7 +10,7 @@ import textwrap
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -130,44 +130,25 @@ def sheet(
         rows, heads: what stands before each row and above each column.
         panel_in: side of a square, inches.
     """
-    import cv2
-
-    assert len(images) == len(titles) > 0
-    columns, size = min(columns, len(images)), 7 if panel_in < 2 else 9
-    side = round(panel_in * _DPI)
-    left = round((1.05 if rows else 0.05) * _DPI)
-    tops = [round(((0.45 if heading else 0.1) + (0.35 if heads else 0)) * _DPI)]
-    for first in range(0, len(images), columns):
-        lines = 1 + max(title.count("\n") for title in titles[first : first + columns])
-        tops.append(tops[-1] + side + round((0.1 + 0.018 * size * lines) * _DPI))
-    high = tops[-1]
-    wide = left + columns * side + round(0.05 * _DPI)
-    canvas = np.full((high, wide, 3), _rgb(PAPER), dtype=np.uint8)
-    figure = blank(wide / _DPI, high / _DPI, _DPI)
-
-    def write(x: float, y: float, words: str, size: float, colour: str, **style: str) -> None:
-        place = {"ha": "center", "va": "center", **style}
-        figure.text(x / wide, 1 - y / high, words, fontsize=size, color=colour, parse_math=False,
-                    **place)  # type: ignore[arg-type] # fmt: skip
-
-    for i, (image, title) in enumerate(zip(images, titles, strict=True)):
-        x, y = left + i % columns * side, tops[i // columns]
-        if image is not None:
-            scale = 0.96 * side / max(image.shape[:2])
-            h, w = (max(1, round(length * scale)) for length in image.shape[:2])
-            at_y, at_x = y + (side - h) // 2, x + (side - w) // 2
-            small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
-            canvas[at_y : at_y + h, at_x : at_x + w] = small
-        write(x + side / 2, y + side + 3, title, size, SOFT, va="top")
+    columns = min(columns, len(images))
+    count = -(-len(images) // columns)
+    wide, high = columns * panel_in + bool(rows), count * (panel_in + 0.3) + 0.4 * bool(heading)
+    figure = blank(wide, high, _DPI, constrained=True)
+    figure.suptitle(heading, fontsize=11, color=INK, weight="bold", parse_math=False)
+    small: dict[str, Any] = {"fontsize": 7 if panel_in < 2 else 9, "color": SOFT}
+    for i, axes in enumerate(figure.subplots(count, columns, squeeze=False).flat):
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
+        if i < len(images) and (image := images[i]) is not None:
+            axes.imshow(image)
+        else:
+            axes.set(facecolor=PAPER, aspect="equal")
+        axes.set_xlabel(titles[i] if i < len(titles) else "", parse_math=False, **small)
         if i % columns == 0 and i // columns < len(rows):
-            write(left - 12, y + side / 2, rows[i // columns], 9, INK, ha="right")
-    for column, head in enumerate(heads[:columns]):
-        words = textwrap.fill(head, round(18 * panel_in))
-        write(left + (column + 0.5) * side, tops[0] - 0.2 * _DPI, words, 8, INK)
-    write(wide / 2, 0.24 * _DPI, heading, 11, INK, weight="bold")
-    axes = figure.add_axes((0, 0, 1, 1))  # not figimage: notebooks show no figure without axes
-    axes.set_axis_off()
-    axes.imshow(canvas, aspect="auto", interpolation="nearest")
+            axes.set_ylabel(rows[i // columns], fontsize=9, color=INK, rotation=0, ha="right")
+        if i < min(columns, len(heads)):
+            words = textwrap.fill(heads[i], round(18 * panel_in))
+            axes.set_title(words, fontsize=8, color=INK, parse_math=False)
     return figure
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.text import Text
 
 from qs3.report.pipeline import makes_rooms, pipeline_figure, room_figure, scan_object
 from tests.report.made_runs import not_blank
@@ -20,7 +21,7 @@ def speckle():
 
 
 def words(figure):
-    return " | ".join(text.get_text() for text in figure.texts)
+    return " | ".join(text.get_text() for text in figure.findobj(Text))
 
 
 def test_residuals_are_distances_that_trimesh_finds(speckle):

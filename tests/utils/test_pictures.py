@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from qs3.utils.pictures import PANEL, axes_of, cloud_image, sheet, value_image
 
@@ -48,4 +49,4 @@ def test_a_sheet_keeps_the_shape_of_its_images():
     seen = np.asarray(figure.canvas.buffer_rgba())[..., :3]
     rows, columns = np.nonzero((seen == 0).all(axis=2))
     assert np.ptp(columns) / np.ptp(rows) == pytest.approx(3, abs=0.1)
-    assert {"a", "h", "r", "x", "y"} <= {text.get_text() for text in figure.texts}
+    assert {"a", "h", "r", "x", "y"} <= {text.get_text() for text in figure.findobj(Text)}
