@@ -65,9 +65,12 @@ class EpochRows(Callback):
             logger.log_metrics(row, step=epoch)
         if self.phases.ends(epoch) or time.monotonic() - self._logged > _SECONDS:
             self._logged = time.monotonic()
-            name = "warm-up" if phase == 0 else f"round {phase - 1} of {self.phases.rounds}"
+            rounds = self.phases.rounds
+            where = f"seed {pl_module.seed}, epoch {epoch + 1} of {self.phases.total}"
+            if rounds:
+                where += f", round {phase - 1} of {rounds}" if phase else ", warm-up"
             shown = ", ".join(f"{key} {value:.3f}" for key, value in figures.items())
-            log.info("epoch %d of %d: %s, %s", epoch + 1, trainer.max_epochs, name, shown)
+            log.info("%s: %s", where, shown)
 
     def _rows(self, before: int) -> list[dict[str, str]]:
         """Those of earlier epochs, as written."""
